@@ -1,0 +1,134 @@
+"""What a file holds, on the host, in NumPy. Nothing here knows of a renderer.
+
+Conventions, the same in the whole package (they are glTF 2.0's):
+
+- right-handed, **+Y up**, metres; counter-clockwise faces look outward;
+- texture coordinates: (0, 0) is the **top left** corner of the image, v grows downward;
+- row 0 of a texture is its top row;
+- base-colour textures are sRGB encoded, all others linear; factors are linear;
+- normal maps: tangent space, green up ("OpenGL"), stored as ``(n + 1) / 2``;
+- tangents ``(x, y, z, w)`` with bitangent = w * cross(normal, tangent).
+
+Loaders convert what they read to these conventions; savers convert back.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+ColorSpace = Literal["srgb", "linear"]
+Wrap = Literal["repeat", "clamp", "mirror"]
+AlphaMode = Literal["opaque", "mask", "blend"]
+
+
+@dataclass(frozen=True)
+class Texture:
+    """An image as stored.
+
+    ``pixels``: (H, W, C), C in 1..4, row 0 on top; uint8 and uint16 stand for [0, 1], float32 for
+    itself. ``color_space`` says how to decode the first three channels; a fourth channel (alpha) is
+    always linear.
+    """
+
+    pixels: NDArray
+    color_space: ColorSpace = "linear"
+    wrap: tuple[Wrap, Wrap] = ("repeat", "repeat")
+
+    def linear(self) -> NDArray[np.float32]:
+        """Decoded pixels: (H, W, C) float32, linear."""
+        x = self.pixels
+        if x.dtype == np.uint8 and self.color_space == "srgb":
+            table = srgb_to_linear(np.arange(256, dtype=np.float32) / np.float32(255))
+            out = table[x]
+            if x.shape[2] == 4:
+                out[..., 3] = x[..., 3].astype(np.float32) / np.float32(255)
+            return out
+        if x.dtype == np.uint8:
+            out = x.astype(np.float32) / np.float32(255)
+        elif x.dtype == np.uint16:
+            out = x.astype(np.float32) / np.float32(65535)
+        else:
+            out = x.astype(np.float32)
+        if self.color_space == "srgb":
+            out[..., :3] = srgb_to_linear(out[..., :3])
+        return out
+
+
+@dataclass(frozen=True)
+class Material:
+    """glTF 2.0 metallic-roughness material (what a texture gives is multiplied by its factor).
+
+    ``base_color``: linear RGB factor. ``orm_texture``: R occlusion (kept, not used), G roughness,
+    B metalness, as glTF packs them. ``opacity``/``alpha_mode``/``alpha_cutoff`` are carried for
+    later use; opaque rendering ignores them.
+    """
+
+    name: str = "material"
+    base_color: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    roughness: float = 1.0
+    metalness: float = 0.0
+    normal_scale: float = 1.0
+    base_color_texture: Texture | None = None
+    orm_texture: Texture | None = None
+    normal_texture: Texture | None = None
+    opacity: float = 1.0
+    alpha_mode: AlphaMode = "opaque"
+    alpha_cutoff: float = 0.5
+    double_sided: bool = True
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """One indexed triangle mesh with one material, in world space.
+
+    ``positions`` (V, 3) float32; ``faces`` (F, 3) int32; ``normals`` (V, 3) unit or None (none in
+    the file); ``uvs`` (V, 2) or None; ``tangents`` (V, 4) or None; ``colors`` (V, 3) linear vertex
+    colours or None. Vertices are split at UV and normal seams, as in the file.
+    """
+
+    positions: NDArray[np.float32]
+    faces: NDArray[np.int32]
+    normals: NDArray[np.float32] | None = None
+    uvs: NDArray[np.float32] | None = None
+    tangents: NDArray[np.float32] | None = None
+    colors: NDArray[np.float32] | None = None
+    material: Material = field(default_factory=Material)
+    name: str = "mesh"
+
+
+@dataclass(frozen=True)
+class Asset:
+    """All meshes of one file, node transforms applied. ``notes`` lists, one line each, what the
+    loader dropped, repaired or assumed. ``up_axis`` and ``metres_per_unit`` are those of the file
+    the asset came from; the data itself is +Y up, in metres."""
+
+    meshes: tuple[Mesh, ...]
+    name: str = "asset"
+    notes: tuple[str, ...] = ()
+    up_axis: Literal["X", "Y", "Z"] = "Y"
+    metres_per_unit: float = 1.0
+
+    @property
+    def triangle_count(self) -> int:
+        return sum(len(m.faces) for m in self.meshes)
+
+    def bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Corners (3,), (3,) of the axis-aligned box around all referenced vertices."""
+        used = [m.positions[np.unique(m.faces)] for m in self.meshes if len(m.faces)]
+        low = np.min([p.min(axis=0) for p in used], axis=0).astype(np.float64)
+        high = np.max([p.max(axis=0) for p in used], axis=0).astype(np.float64)
+        return low, high
+
+
+def srgb_to_linear(x: NDArray) -> NDArray:
+    """IEC 61966-2-1 decoding of values in [0, 1] (any shape)."""
+    return np.where(x <= 0.04045, x / 12.92, ((np.maximum(x, 0.0) + 0.055) / 1.055) ** 2.4).astype(x.dtype)
+
+
+def linear_to_srgb(x: NDArray) -> NDArray:
+    """IEC 61966-2-1 encoding of linear values in [0, 1] (any shape)."""
+    return np.where(x <= 0.0031308, x * 12.92, 1.055 * np.maximum(x, 1e-12) ** (1 / 2.4) - 0.055).astype(x.dtype)
