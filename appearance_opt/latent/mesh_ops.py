@@ -1,0 +1,84 @@
+"""Differentiable operations on the latent mesh: normals and tangent frames of moving positions.
+
+Each is a pure function of flat device buffers. The definitions are those of the exporter and of the
+closed-form transfer (``asset.normals``, ``asset.tangents``): angle-weighted vertex normals (Thuermer and
+Wuethrich 1998) and MikkTSpace's tangents.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from appearance_opt.render.math import clamp
+
+TINY = 1e-20
+
+
+@dataclass
+class Corners:
+    """Fixed connectivity of F triangles over V welded vertices and R render vertices (split at UV
+    seams). ``vertex``: 3 index arrays of width F into the vertices; ``frame``: the same into the render
+    vertices; ``frame_vertex``: (R,) vertex of each render vertex; ``uvs``: (2 R,) flat."""
+
+    vertex: tuple[mi.UInt32, mi.UInt32, mi.UInt32]
+    frame: tuple[mi.UInt32, mi.UInt32, mi.UInt32]
+    frame_vertex: mi.UInt32
+    uvs: mi.Float
+
+
+def vertex_normals(positions: mi.Float, corners: Corners) -> mi.Vector3f:
+    """Unit normals (V) of flat positions (3 V): face normals weighted by the corner's angle. A vertex
+    whose normals cancel, or that no face uses, gets +Z."""
+    p = [dr.gather(mi.Point3f, positions, i) for i in corners.vertex]
+    normal = _unit(dr.cross(p[1] - p[0], p[2] - p[0]))
+    total = dr.zeros(mi.Float, dr.width(positions))
+    for k in range(3):
+        angle = _angle(_unit(p[(k + 1) % 3] - p[k]), _unit(p[(k + 2) % 3] - p[k]))
+        dr.scatter_add(total, normal * angle, corners.vertex[k])
+    summed = dr.unravel(mi.Vector3f, total)
+    squared = dr.squared_norm(summed)
+    ok = squared > TINY
+    return dr.select(ok, summed * dr.rsqrt(dr.select(ok, squared, 1)), mi.Vector3f(0, 0, 1))
+
+
+def tangent_frames(positions: mi.Float, normals: mi.Vector3f, corners: Corners) -> mi.Vector3f:
+    """Unit tangents (R): per corner the direction of growing u, projected on the plane of the corner's
+    vertex normal, normalised, weighted by the angle in that plane (MikkTSpace)."""
+    p = [dr.gather(mi.Point3f, positions, i) for i in corners.vertex]
+    uv = [dr.gather(mi.Point2f, corners.uvs, i) for i in corners.frame]
+    a, b = uv[1] - uv[0], uv[2] - uv[0]
+    determinant = a.x * b.y - a.y * b.x
+    along_u = ((p[1] - p[0]) * b.y - (p[2] - p[0]) * a.y) * dr.sign(determinant)
+    usable = dr.abs(determinant) > TINY
+    total = dr.zeros(mi.Float, 3 * dr.width(corners.frame_vertex))
+    for k in range(3):
+        n = dr.gather(mi.Vector3f, normals, corners.vertex[k])
+        edge, other = p[(k + 1) % 3] - p[k], p[(k + 2) % 3] - p[k]
+        angle = _angle(_unit(_in_plane(edge, n)), _unit(_in_plane(other, n)))
+        value = dr.select(usable, _unit(_in_plane(along_u, n)) * angle, 0)
+        dr.scatter_add(total, value, corners.frame[k])
+    summed = dr.unravel(mi.Vector3f, total)
+    squared = dr.squared_norm(summed)
+    ok = squared > TINY
+    n = dr.gather(mi.Vector3f, normals, corners.frame_vertex)
+    fallback = dr.normalize(dr.cross(n, dr.select(dr.abs(n.x) < 0.9, mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0))))
+    return dr.select(ok, summed * dr.rsqrt(dr.select(ok, squared, 1)), fallback)
+
+
+def _in_plane(v: mi.Vector3f, n: mi.Vector3f) -> mi.Vector3f:
+    return v - n * dr.dot(n, v)
+
+
+def _unit(v: mi.Vector3f) -> mi.Vector3f:
+    """v / |v|, and zero with a zero gradient where v is (nearly) zero."""
+    squared = dr.squared_norm(v)
+    ok = squared > 1e-30
+    return dr.select(ok, v * dr.rsqrt(dr.select(ok, squared, 1)), 0)
+
+
+def _angle(a: mi.Vector3f, b: mi.Vector3f) -> mi.Float:
+    """Angle between unit vectors, with a finite derivative for parallel ones."""
+    return dr.acos(clamp(dr.dot(a, b), -1 + 1e-6, 1 - 1e-6))

@@ -1,0 +1,126 @@
+"""The usual reference: a mesh with materials, drawn by our own renderer without gradients."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from appearance_opt.asset.normals import vertex_normals
+from appearance_opt.asset.tangents import split_and_tangents
+from appearance_opt.reference.textures import material_maps
+from appearance_opt.render import deferred, upload
+from appearance_opt.render.deferred import Grid
+from appearance_opt.render.surface import Surface
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from appearance_opt.asset.types import Asset, Mesh
+    from appearance_opt.views import Views
+
+MAX_PIXELS = 1 << 20
+"""Pixels rendered at once: more saves no time and costs memory."""
+
+
+@dataclass(frozen=True)
+class MergedMesh:
+    """All meshes of an asset as one, vertices split where attributes differ. See ``asset.types.Mesh``.
+    ``material``: (F,) index into the asset's materials, in the order of its meshes."""
+
+    positions: NDArray[np.float32]
+    normals: NDArray[np.float32]
+    uvs: NDArray[np.float32]
+    tangents: NDArray[np.float32] | None
+    colors: NDArray[np.float32] | None
+    faces: NDArray[np.int32]
+    material: NDArray[np.int32]
+
+
+class MeshReference:
+    """Renders an asset. Also answers what its surface looks like at given points (for the transfer).
+
+    ``merged``: the host arrays; ``scene``: for tracing rays; ``surface``, ``maps``: device data.
+    """
+
+    def __init__(self, asset: Asset) -> None:
+        materials = list(dict.fromkeys(id(m.material) for m in asset.meshes))
+        by_id = {id(m.material): m.material for m in asset.meshes}
+        self.maps = material_maps([by_id[k] for k in materials])
+        self.merged = merge(asset, [materials.index(id(m.material)) for m in asset.meshes], self.maps.has_normal_map)
+        m = self.merged
+        self.scene = upload.scene_of(m.positions, m.faces)
+        if m.tangents is None:
+            frames = upload.packets(2, m.uvs)
+        else:
+            frames = upload.packets(8, m.uvs, m.tangents[:, 3], np.zeros(len(m.uvs)), m.tangents[:, :3])
+        padding = np.zeros(len(m.positions))
+        self.surface = Surface(
+            faces=upload.index_packets(m.faces, m.material),
+            vertices=upload.packets(8, m.positions, padding, m.normals),
+            frames=frames if self.maps.pyramid is not None else None,
+            colors=None if m.colors is None else upload.packets(4, m.colors),
+            has_tangents=m.tangents is not None,
+        )
+
+    def render(self, views: Views, resolution: int, samples: int = 16) -> NDArray[np.float32]:
+        """See ``Reference.render``."""
+        step = max(1, MAX_PIXELS // (resolution * resolution))
+        images = []
+        for start in range(0, len(views), step):
+            part = views[start : start + step]
+            image = self.render_device(part.records(), len(part), resolution, samples)
+            images.append(np.array(image).reshape(len(part), resolution, resolution, 4))
+        return images[0] if len(images) == 1 else np.concatenate(images)
+
+    def render_device(self, records: mi.Float, views: int, resolution: int, samples: int) -> mi.Float:
+        """The same for a batch whose records are on the device; the image stays there, flat."""
+        with dr.suspend_grad():
+            return deferred.render_image(self.scene, self.surface, self.maps, records, Grid(views, resolution), samples)
+
+
+def merge(asset: Asset, material_of: list[int], need_tangents: bool) -> MergedMesh:
+    """Concatenate the meshes of an asset; computes what a mesh lacks (angle-weighted normals,
+    MikkTSpace tangents where a normal map needs them, zero UVs, white vertex colours)."""
+    need_colors = any(m.colors is not None for m in asset.meshes)
+    parts = [_complete(m, need_tangents, need_colors) for m in asset.meshes]
+    start = np.cumsum([0] + [len(p.positions) for p in parts[:-1]])
+
+    def join(name: str) -> NDArray:
+        return np.concatenate([getattr(p, name) for p in parts])
+
+    return MergedMesh(
+        positions=join("positions"),
+        normals=join("normals"),
+        uvs=join("uvs"),
+        tangents=join("tangents") if need_tangents else None,
+        colors=join("colors") if need_colors else None,
+        faces=np.concatenate([p.faces + s for p, s in zip(parts, start, strict=True)]).astype(np.int32),
+        material=np.repeat(np.array(material_of, np.int32), [len(p.faces) for p in parts]),
+    )
+
+
+def _complete(mesh: Mesh, need_tangents: bool, need_colors: bool) -> MergedMesh:
+    positions, faces = mesh.positions, mesh.faces
+    normals = vertex_normals(positions, faces) if mesh.normals is None else mesh.normals
+    uvs = np.zeros((len(positions), 2), np.float32) if mesh.uvs is None else mesh.uvs
+    colors = mesh.colors if mesh.colors is not None else np.ones((len(positions), 3), np.float32)
+    tangents = mesh.tangents
+    if need_tangents and tangents is None:
+        if mesh.material.normal_texture is None or mesh.uvs is None:
+            tangents = _any_tangent(normals)
+        else:
+            index, faces, tangents = split_and_tangents(positions, normals, uvs, faces)
+            positions, normals, uvs, colors = positions[index], normals[index], uvs[index], colors[index]
+    return MergedMesh(positions, normals, uvs, tangents, colors if need_colors else None, faces, np.empty(0, np.int32))
+
+
+def _any_tangent(normals: NDArray) -> NDArray[np.float32]:
+    """Some unit tangent (V, 4) for meshes whose normal map is flat: which one does not matter."""
+    axis = np.where(np.abs(normals[:, :1]) < 0.9, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
+    t = np.cross(normals, axis)
+    t /= np.maximum(np.linalg.norm(t, axis=1, keepdims=True), 1e-20)
+    return np.concatenate([t, np.ones((len(t), 1))], axis=1).astype(np.float32)

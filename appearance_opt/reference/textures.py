@@ -1,0 +1,79 @@
+"""Textures of an asset's materials as packed texels of the renderer."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from appearance_opt.render.material import MaterialMaps
+from appearance_opt.render.texture import CLAMP, MIRROR, REPEAT, build_pyramid
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from appearance_opt.asset.types import Material, Texture
+
+_WRAP = {"repeat": REPEAT, "clamp": CLAMP, "mirror": MIRROR}
+_PLAIN = ("red", "green", "blue", "roughness", "metalness")
+_FULL = (*_PLAIN, "normal_x", "normal_y", "normal_z")
+
+
+def material_maps(materials: list[Material]) -> MaterialMaps:
+    """Maps of all materials in one pyramid, or constants when the only material has no texture.
+
+    Maps of one material that differ in size are brought to the largest of them.
+    """
+    textured = [m for m in materials if _textures(m)]
+    if not textured and len(materials) == 1:
+        only = materials[0]
+        constants = dict(zip(_PLAIN, (*only.base_color, only.roughness, only.metalness), strict=True))
+        return MaterialMaps(constants=constants)
+    channels = _FULL if any(m.normal_texture is not None for m in materials) else _PLAIN
+    bases = [_packed(m, channels is _FULL) for m in materials]
+    # a material's maps share one wrap mode here: horizontal wrap of its first texture
+    wraps = [_WRAP[_textures(m)[0].wrap[0]] if _textures(m) else REPEAT for m in materials]
+    return MaterialMaps(channels, build_pyramid(bases, wraps))
+
+
+def _textures(m: Material) -> list[Texture]:
+    return [t for t in (m.base_color_texture, m.orm_texture, m.normal_texture) if t is not None]
+
+
+def _packed(m: Material, with_normals: bool) -> NDArray[np.float32]:
+    """(H, W, 8) texels: base colour, roughness, metalness, tangent-space normal in [-1, 1]."""
+    shapes = [t.pixels.shape[:2] for t in _textures(m)] or [(1, 1)]
+    height, width = max(s[0] for s in shapes), max(s[1] for s in shapes)
+    out = np.zeros((height, width, 8), np.float32)
+    out[..., :3] = m.base_color
+    out[..., 3] = m.roughness
+    out[..., 4] = m.metalness
+    out[..., 7] = 1.0 if with_normals else 0.0
+    if m.base_color_texture is not None:
+        texture = _resized(m.base_color_texture.linear(), height, width)
+        out[..., :3] *= texture[..., :3] if texture.shape[2] >= 3 else texture[..., :1]
+    if m.orm_texture is not None:
+        texture = _resized(m.orm_texture.linear(), height, width)
+        out[..., 3] *= texture[..., 1]
+        out[..., 4] *= texture[..., 2]
+    if m.normal_texture is not None:
+        texture = _resized(m.normal_texture.linear(), height, width)
+        out[..., 5:8] = texture[..., :3] * 2 - 1
+        out[..., 5:7] *= m.normal_scale
+    return out
+
+
+def _resized(pixels: NDArray[np.float32], height: int, width: int) -> NDArray[np.float32]:
+    """Bilinear enlargement with texel centres at (i + 0.5) / size."""
+    if pixels.shape[:2] == (height, width):
+        return pixels
+    for axis, size in ((0, height), (1, width)):
+        old = pixels.shape[axis]
+        at = np.clip((np.arange(size) + 0.5) * old / size - 0.5, 0, old - 1)
+        lower = np.floor(at).astype(np.intp)
+        upper = np.minimum(lower + 1, old - 1)
+        shape = [1, 1, 1]
+        shape[axis] = size
+        fraction = (at - lower).astype(np.float32).reshape(shape)
+        pixels = pixels.take(lower, axis) * (1 - fraction) + pixels.take(upper, axis) * fraction
+    return pixels

@@ -1,0 +1,58 @@
+"""Surface reflection: Lambert plus isotropic GGX under one point light.
+
+The formulas are those of glTF 2.0, appendix B (Schlick Fresnel, height-correlated Smith), so that what
+the fit sees is what engines show. Specular colour k_s = (1 - m) 0.04 + m k_d, scaled by (1 - gamma),
+after Hasselgren et al. 2021, section 3; gamma exists only when a latent fits it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from appearance_opt.render.math import at_least, clamp
+
+ROUGHNESS_FLOOR = 0.08
+"""Smallest roughness (GGX alpha = roughness^2), after the paper: below it a highlight of a point light
+is smaller than a pixel and its gradient useless."""
+
+
+@dataclass
+class MaterialSample:
+    """Material at each sample. ``base_color``: linear. ``normal``: tangent-space normal, not
+    normalised, or None without a normal map. ``gamma``: specular attenuation or None."""
+
+    base_color: mi.Color3f
+    roughness: mi.Float
+    metalness: mi.Float
+    normal: mi.Vector3f | None = None
+    gamma: mi.Float | None = None
+
+
+def reflect(material: MaterialSample, n: mi.Vector3f, v: mi.Vector3f, l: mi.Vector3f) -> mi.Color3f:  # noqa: E741
+    """BRDF times the cosine of the light, for unit shading normal n, directions to viewer v and light l.
+
+    Zero where the light is below the shading horizon. Reflectance per steradian (linear RGB).
+    """
+    alpha = dr.square(at_least(material.roughness, ROUGHNESS_FLOOR))
+    alpha2 = dr.square(alpha)
+    f0 = dr.fma(material.metalness, material.base_color - 0.04, mi.Color3f(0.04))
+    if material.gamma is not None:
+        f0 *= 1 - material.gamma
+    diffuse = material.base_color * ((1 - material.metalness) * dr.inv_pi)
+    h = dr.normalize(l + v)
+    nl = at_least(dr.dot(n, l), 0)
+    nv = at_least(dr.dot(n, v), 1e-3)
+    nh = clamp(dr.dot(n, h), 0, 1)
+    vh = clamp(dr.dot(v, h), 0, 1)
+    # (n.h)^2 (alpha^2 - 1) + 1, written so that it keeps its digits when n.h is near 1
+    denominator = dr.fma(dr.square(nh), alpha2, (1 - nh) * (1 + nh))
+    distribution = alpha2 * dr.inv_pi / dr.square(denominator)
+    smith = nl * dr.sqrt(dr.fma(dr.square(nv), 1 - alpha2, alpha2))
+    smith += nv * dr.sqrt(dr.fma(dr.square(nl), 1 - alpha2, alpha2))
+    visibility = 0.5 / at_least(smith, 1e-6)
+    c = 1 - vh
+    fresnel = dr.fma(1 - f0, dr.square(dr.square(c)) * c, f0)
+    return (dr.fma(-fresnel, diffuse, diffuse) + fresnel * (distribution * visibility)) * nl

@@ -1,0 +1,188 @@
+"""One differentiable batch of images: forward now, gradients when the caller knows dLoss/dImage.
+
+Between the two stands the loss, which is a function of whole pixels. So the backward pass shades the same
+samples again, with gradients, and pulls back
+
+    sum over samples  weight * <dLoss/dI(pixel), colour>                      (interior)
+  + sum over silhouette points  length * <dLoss/dI(pixel), c_in - c_out> n.x  (visibility),
+
+everything but the surface's buffers held fixed. The image itself is never differentiated.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from appearance_opt.render import rays, silhouette
+from appearance_opt.render.deferred import Grid, pixel_index, shade
+from appearance_opt.render.material import MaterialMaps
+from appearance_opt.render.rays import MISS, Samples
+from appearance_opt.render.silhouette import EdgeList, EdgeSamples
+from appearance_opt.render.surface import Surface
+
+
+@dataclass(frozen=True)
+class Quality:
+    """How finely visibility is sampled. ``edge_density``: silhouette points per pixel of silhouette
+    (0: no visibility gradient); ``edge_samples``: camera rays in each pixel that a silhouette crosses
+    (all other pixels take one)."""
+
+    edge_density: float = 1.0
+    edge_samples: int = 8
+
+
+@dataclass
+class Frame:
+    """A rendered batch and what its backward pass needs.
+
+    ``image``: (pixels * 4) premultiplied linear radiance and coverage. ``samples``: the covered camera
+    rays with their ``pixel`` and ``weight``; None where nothing was hit. ``edges``: visible silhouette
+    points, None without any; ``contrast``: c_in - c_out at them, premultiplied RGB and coverage.
+    """
+
+    grid: Grid
+    records: mi.Float
+    image: mi.Float
+    samples: Samples | None
+    pixel: mi.UInt32 | None
+    weight: mi.Float | None
+    edges: EdgeSamples | None
+    contrast: mi.ArrayXf | None
+
+
+def render(
+    scene: mi.Scene,
+    surface: Surface,
+    maps: MaterialMaps,
+    edge_list: EdgeList | None,
+    records: mi.Float,
+    grid: Grid,
+    quality: Quality,
+    seed: int,
+) -> Frame:
+    """Forward pass, without gradients (``surface`` and ``maps`` are read detached)."""
+    size = dr.opaque(mi.Float, grid.resolution)
+    rows = dr.opaque(mi.UInt32, grid.resolution)
+    with dr.suspend_grad():
+        edges = None
+        if edge_list is not None and quality.edge_density > 0:
+            edges = silhouette.sample_edges(
+                scene, edge_list, surface.vertices, records, grid.views, grid.resolution, quality.edge_density, seed
+            )
+        samples, pixel, weight = _camera_samples(scene, records, grid, size, rows, edges, quality.edge_samples)
+        image = dr.zeros(mi.Float, grid.pixels * 4)
+        if samples is not None:
+            width = dr.opaque(mi.Float, 1.0)
+            c = shade(surface, maps, records, samples, size, width)
+            value = mi.ArrayXf([c.x * weight, c.y * weight, c.z * weight, weight])
+            dr.scatter_reduce(dr.ReduceOp.Add, image, value, pixel, mode=dr.ReduceMode.Local)
+        contrast = None if edges is None else _contrast(surface, maps, records, edges, size)
+        dr.eval(image, contrast)
+    return Frame(grid, records, image, samples, pixel, weight, edges, contrast)
+
+
+def surrogate(
+    frame: Frame, surface: Surface, maps: MaterialMaps, edge_list: EdgeList | None, image_gradient: mi.Float
+) -> mi.Float:
+    """Scalar whose derivative is the loss's, for ``image_gradient`` = dLoss/dImage (pixels * 4).
+
+    Only its gradient means anything. Zero width-1 array when the frame is empty.
+    """
+    size = dr.opaque(mi.Float, frame.grid.resolution)
+    total = mi.Float(0)
+    if frame.samples is not None:
+        assert frame.pixel is not None and frame.weight is not None
+        color = shade(surface, maps, frame.records, frame.samples, size, dr.opaque(mi.Float, 1.0))
+        g = _pixel(image_gradient, frame.pixel)
+        total += dr.sum(dr.fma(g[0], color.x, dr.fma(g[1], color.y, g[2] * color.z)) * frame.weight)
+    if frame.edges is not None and edge_list is not None and dr.grad_enabled(surface.vertices):
+        assert frame.contrast is not None
+        g, c = _pixel(image_gradient, frame.edges.pixel), frame.contrast
+        jump = dr.fma(g[0], c[0], dr.fma(g[1], c[1], dr.fma(g[2], c[2], g[3] * c[3]))) * frame.edges.length
+        moved = silhouette.motion(edge_list, surface.vertices, frame.records, frame.edges, size)
+        total += dr.sum(jump * moved)
+    return total
+
+
+def _camera_samples(
+    scene: mi.Scene,
+    records: mi.Float,
+    grid: Grid,
+    size: mi.Float,
+    rows: mi.UInt32,
+    edges: EdgeSamples | None,
+    edge_samples: int,
+) -> tuple[Samples | None, mi.UInt32 | None, mi.Float | None]:
+    """Covered camera rays: one in the middle of each pixel, ``edge_samples`` where a silhouette passes."""
+    view, column, row = rays.pixel_grid(grid.views, grid.resolution)
+    hits = rays.trace(scene, records, view, mi.Float(column) + 0.5, mi.Float(row) + 0.5, size)
+    covered = hits.triangle != MISS
+    pixel = pixel_index(hits, rows)
+    if edges is None or edge_samples <= 1:
+        index = dr.compress(covered)
+        if dr.width(index) == 0:
+            return None, None, None
+        samples = rays.keep(hits, index)
+        return samples, dr.gather(mi.UInt32, pixel, index), dr.full(mi.Float, 1, dr.width(index))
+    crossed = dr.zeros(mi.Bool, grid.pixels)
+    dr.scatter(crossed, mi.Bool(True), edges.pixel)
+    on_edge = dr.gather(mi.Bool, crossed, pixel)
+    dr.eval(hits, pixel, on_edge)
+    index = dr.compress(covered & ~on_edge)
+    plain = rays.keep(hits, index)
+    fine = _fine_samples(scene, records, hits, dr.compress(on_edge), size, edge_samples)
+    samples = _concat(plain, fine)
+    weight = dr.concat(
+        [dr.full(mi.Float, 1, dr.width(index)), dr.full(mi.Float, 1 / edge_samples, dr.width(fine.triangle))]
+    )
+    if dr.width(samples.triangle) == 0:
+        return None, None, None
+    dr.eval(samples, weight)
+    return samples, pixel_index(samples, rows), weight
+
+
+def _fine_samples(
+    scene: mi.Scene, records: mi.Float, hits: Samples, index: mi.UInt32, size: mi.Float, count: int
+) -> Samples:
+    """The hits among ``count`` rays in each of the given pixels."""
+    offsets = mi.Float(rays.sub_pixel_offsets(count).ravel())
+    i = dr.arange(mi.UInt32, dr.width(index) * count)
+    k = i // count
+    at = dr.gather(mi.UInt32, index, k)
+    offset = 2 * (i - k * count)
+    x = dr.floor(dr.gather(mi.Float, hits.x, at)) + dr.gather(mi.Float, offsets, offset)
+    y = dr.floor(dr.gather(mi.Float, hits.y, at)) + dr.gather(mi.Float, offsets, offset + 1)
+    fine = rays.trace(scene, records, dr.gather(mi.UInt32, hits.view, at), x, y, size)
+    return rays.keep(fine, dr.compress(fine.triangle != MISS))
+
+
+def _concat(a: Samples, b: Samples) -> Samples:
+    if dr.width(a.triangle) == 0:
+        return b
+    if dr.width(b.triangle) == 0:
+        return a
+    return Samples(*(dr.concat([getattr(a, f), getattr(b, f)]) for f in ("view", "x", "y", "triangle")))
+
+
+def _contrast(
+    surface: Surface, maps: MaterialMaps, records: mi.Float, edges: EdgeSamples, size: mi.Float
+) -> mi.ArrayXf:
+    """c_in - c_out at the silhouette points: premultiplied RGB and coverage."""
+    both = _concat(edges.inside, edges.outside)
+    covered = both.triangle != MISS
+    both = Samples(both.view, both.x, both.y, dr.select(covered, both.triangle, 0))
+    color = shade(surface, maps, records, both, size, dr.opaque(mi.Float, 1.0)) & covered
+    alpha = dr.select(covered, mi.Float(1), 0)
+    dr.eval(color, alpha)
+    n = dr.width(edges.edge)
+    inner, outer = dr.arange(mi.UInt32, n), dr.arange(mi.UInt32, n) + n
+    return mi.ArrayXf(
+        [dr.gather(mi.Float, c, inner) - dr.gather(mi.Float, c, outer) for c in (color.x, color.y, color.z, alpha)]
+    )
+
+
+def _pixel(image: mi.Float, index: mi.UInt32) -> mi.ArrayXf:
+    return dr.gather(mi.ArrayXf, image, index, shape=(4, dr.width(index)))

@@ -1,0 +1,80 @@
+"""From packed texels to material parameters.
+
+A ``MaterialMaps`` names the channels of its texels; what is not among them is a constant of the job:
+it has no texture, no gradient and no lookup.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import drjit as dr
+import mitsuba as mi
+
+from appearance_opt.render.brdf import MaterialSample
+from appearance_opt.render.math import at_least
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from appearance_opt.render.surface import Hit
+    from appearance_opt.render.texture import Pyramid
+
+CHANNELS = ("red", "green", "blue", "roughness", "metalness", "normal_x", "normal_y", "normal_z", "gamma")
+"""Every channel a material can have. Colours are linear, normals in [-1, 1]; without ``normal_z`` it
+follows from unit length."""
+
+DEFAULTS = {"red": 0.5, "green": 0.5, "blue": 0.5, "roughness": 0.5, "metalness": 0.0}
+
+
+@dataclass
+class MaterialMaps:
+    """``channels``: the name of each channel of ``pyramid``'s texels (padding has no name).
+    ``constants``: values of channels without a texture."""
+
+    channels: tuple[str, ...] = ()
+    pyramid: Pyramid | None = None
+    constants: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def has_normal_map(self) -> bool:
+        return "normal_x" in self.channels
+
+    @property
+    def material_count(self) -> int:
+        return len(self.pyramid.layout.sizes) if self.pyramid is not None else 1
+
+    def replace_texels(self, texels: mi.Float) -> MaterialMaps:
+        """The same maps with other texels."""
+        assert self.pyramid is not None
+        return MaterialMaps(self.channels, self.pyramid.replace(texels), self.constants)
+
+
+def evaluate(maps: MaterialMaps, hit: Hit, active: mi.Bool | None = None) -> MaterialSample:
+    """Material at each hit."""
+    value: dict[str, mi.Float] = {k: mi.Float(v) for k, v in {**DEFAULTS, **maps.constants}.items()}
+    if maps.pyramid is not None and hit.uv is not None:
+        material = hit.material if maps.material_count > 1 else None
+        texel = maps.pyramid.lookup(material, hit.uv, hit.footprint, mi.Bool(True) if active is None else active)
+        value.update(zip(maps.channels, texel, strict=False))
+    base = mi.Color3f(value["red"], value["green"], value["blue"])
+    if hit.color is not None:
+        base *= hit.color
+    normal = None
+    if maps.has_normal_map:
+        x, y = value["normal_x"], value["normal_y"]
+        z = value.get("normal_z")
+        if z is None:
+            z = dr.sqrt(at_least(1 - dr.fma(x, x, y * y), 0.01))
+        normal = mi.Vector3f(x, y, z)
+    return MaterialSample(base, value["roughness"], value["metalness"], normal, value.get("gamma"))
+
+
+def shading_normal(hit: Hit, sample: MaterialSample) -> mi.Vector3f:
+    """World-space shading normal: the normal map in the hit's interpolated frame (glTF 2.0, 3.9.3)."""
+    if sample.normal is None or hit.tangent is None:
+        return hit.normal
+    bitangent = dr.cross(hit.normal, hit.tangent) * hit.handedness
+    t = sample.normal
+    return dr.normalize(hit.tangent * t.x + bitangent * t.y + hit.normal * t.z)

