@@ -61,7 +61,7 @@ class MeshReference:
         self.surface = Surface(
             faces=upload.index_packets(m.faces, m.material),
             vertices=upload.packets(8, m.positions, padding, m.normals),
-            frames=frames if self.maps.pyramid is not None else None,
+            frames=frames if self.maps.layers else None,
             colors=None if m.colors is None else upload.packets(4, m.colors),
             has_tangents=m.tangents is not None,
         )
@@ -70,16 +70,19 @@ class MeshReference:
         """See ``Reference.render``."""
         step = max(1, MAX_PIXELS // (resolution * resolution))
         images = []
+        grid = None
         for start in range(0, len(views), step):
             part = views[start : start + step]
-            image = self.render_device(part.records(), len(part), resolution, samples)
+            if grid is None or grid.views != len(part):
+                grid = Grid(len(part), resolution)
+            image = self.render_device(part.records(), grid, samples)
             images.append(np.array(image).reshape(len(part), resolution, resolution, 4))
         return images[0] if len(images) == 1 else np.concatenate(images)
 
-    def render_device(self, records: mi.Float, views: int, resolution: int, samples: int) -> mi.Float:
+    def render_device(self, records: mi.Float, grid: Grid, samples: int) -> mi.Float:
         """The same for a batch whose records are on the device; the image stays there, flat."""
         with dr.suspend_grad():
-            return deferred.render_image(self.scene, self.surface, self.maps, records, Grid(views, resolution), samples)
+            return deferred.render_image(self.scene, self.surface, self.maps, records, grid, samples)
 
 
 def merge(asset: Asset, material_of: list[int], need_tangents: bool) -> MergedMesh:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from appearance_opt.render.material import MaterialMaps
+from appearance_opt.render.material import MaterialMaps, TexelLayer
 from appearance_opt.render.texture import CLAMP, MIRROR, REPEAT, build_pyramid
 
 if TYPE_CHECKING:
@@ -33,7 +33,7 @@ def material_maps(materials: list[Material]) -> MaterialMaps:
     bases = [_packed(m, channels is _FULL) for m in materials]
     # a material's maps share one wrap mode here: horizontal wrap of its first texture
     wraps = [_WRAP[_textures(m)[0].wrap[0]] if _textures(m) else REPEAT for m in materials]
-    return MaterialMaps(channels, build_pyramid(bases, wraps))
+    return MaterialMaps((TexelLayer(channels, build_pyramid(bases, wraps)),))
 
 
 def _textures(m: Material) -> list[Texture]:

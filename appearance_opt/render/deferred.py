@@ -6,8 +6,6 @@ surface's buffers and the texels; visibility is not (see ``silhouette`` for its 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import drjit as dr
 import mitsuba as mi
 
@@ -17,16 +15,24 @@ from appearance_opt.render.rays import Samples
 from appearance_opt.render.surface import Surface, interpolate
 
 
-@dataclass(frozen=True)
 class Grid:
-    """Size of a batch of square images on the device. ``resolution`` is also kept as an opaque
-    number, so that no kernel is compiled anew for another one."""
+    """The pixels of a batch of square images, on the device, tile by tile (see ``rays.TILE``).
 
-    views: int
-    resolution: int
+    ``size``, ``rows``: the resolution as opaque numbers, so that another one compiles no new kernel.
+    ``view``, ``column``, ``row``: of every pixel. Made once and reused by every step.
+    """
+
+    def __init__(self, views: int, resolution: int) -> None:
+        self.views = views
+        self.resolution = resolution
+        self.size = dr.opaque(mi.Float, resolution)
+        self.rows = dr.opaque(mi.UInt32, resolution)
+        self.view, self.column, self.row = rays.pixel_grid(views, resolution)
+        dr.eval(self.view, self.column, self.row)
 
     @property
     def pixels(self) -> int:
+        """Pixels of the whole batch."""
         return self.views * self.resolution * self.resolution
 
 
@@ -60,25 +66,21 @@ def render_image(
     Returns (pixels * 4) premultiplied linear radiance and coverage. One sample of all pixels at a time,
     so that memory does not grow with ``samples``.
     """
-    size = dr.opaque(mi.Float, grid.resolution)
-    rows = dr.opaque(mi.UInt32, grid.resolution)
     width = dr.opaque(mi.Float, samples**-0.5)
-    view, column, row = rays.pixel_grid(grid.views, grid.resolution)
-    dr.eval(view, column, row)
     image = dr.zeros(mi.Float, grid.pixels * 4)
     weight = dr.opaque(mi.Float, 1 / samples)
     for dx, dy in rays.sub_pixel_offsets(samples):
-        x = mi.Float(column) + dr.opaque(mi.Float, dx)
-        y = mi.Float(row) + dr.opaque(mi.Float, dy)
-        hits = rays.trace(scene, records, view, x, y, size)
+        x = mi.Float(grid.column) + dr.opaque(mi.Float, dx)
+        y = mi.Float(grid.row) + dr.opaque(mi.Float, dy)
+        hits = rays.trace(scene, records, grid.view, x, y, grid.size)
         dr.eval(hits)
         index = dr.compress(hits.triangle != rays.MISS)
         if dr.width(index) == 0:
             continue
         hits = rays.keep(hits, index)
-        color = shade(surface, maps, records, hits, size, width)
+        color = shade(surface, maps, records, hits, grid.size, width)
         value = mi.ArrayXf([color.x * weight, color.y * weight, color.z * weight, weight])
         # one sample per pixel in each pass: no two threads meet
-        dr.scatter_reduce(dr.ReduceOp.Add, image, value, pixel_index(hits, rows), mode=dr.ReduceMode.NoConflicts)
+        dr.scatter_reduce(dr.ReduceOp.Add, image, value, pixel_index(hits, grid.rows), mode=dr.ReduceMode.NoConflicts)
         dr.eval(image)
     return image

@@ -64,22 +64,20 @@ def render(
     seed: int,
 ) -> Frame:
     """Forward pass, without gradients (``surface`` and ``maps`` are read detached)."""
-    size = dr.opaque(mi.Float, grid.resolution)
-    rows = dr.opaque(mi.UInt32, grid.resolution)
     with dr.suspend_grad():
         edges = None
         if edge_list is not None and quality.edge_density > 0:
             edges = silhouette.sample_edges(
-                scene, edge_list, surface.vertices, records, grid.views, grid.resolution, quality.edge_density, seed
+                scene, edge_list, surface.vertices, records, grid, quality.edge_density, seed
             )
-        samples, pixel, weight = _camera_samples(scene, records, grid, size, rows, edges, quality.edge_samples)
+        samples, pixel, weight = _camera_samples(scene, records, grid, edges, quality.edge_samples)
         image = dr.zeros(mi.Float, grid.pixels * 4)
         if samples is not None:
             width = dr.opaque(mi.Float, 1.0)
-            c = shade(surface, maps, records, samples, size, width)
+            c = shade(surface, maps, records, samples, grid.size, width)
             value = mi.ArrayXf([c.x * weight, c.y * weight, c.z * weight, weight])
             dr.scatter_reduce(dr.ReduceOp.Add, image, value, pixel, mode=dr.ReduceMode.Local)
-        contrast = None if edges is None else _contrast(surface, maps, records, edges, size)
+        contrast = None if edges is None else _contrast(surface, maps, records, edges, grid.size)
         dr.eval(image, contrast)
     return Frame(grid, records, image, samples, pixel, weight, edges, contrast)
 
@@ -91,7 +89,7 @@ def surrogate(
 
     Only its gradient means anything. Zero width-1 array when the frame is empty.
     """
-    size = dr.opaque(mi.Float, frame.grid.resolution)
+    size = frame.grid.size
     total = mi.Float(0)
     if frame.samples is not None:
         assert frame.pixel is not None and frame.weight is not None
@@ -111,16 +109,13 @@ def _camera_samples(
     scene: mi.Scene,
     records: mi.Float,
     grid: Grid,
-    size: mi.Float,
-    rows: mi.UInt32,
     edges: EdgeSamples | None,
     edge_samples: int,
 ) -> tuple[Samples | None, mi.UInt32 | None, mi.Float | None]:
     """Covered camera rays: one in the middle of each pixel, ``edge_samples`` where a silhouette passes."""
-    view, column, row = rays.pixel_grid(grid.views, grid.resolution)
-    hits = rays.trace(scene, records, view, mi.Float(column) + 0.5, mi.Float(row) + 0.5, size)
+    hits = rays.trace(scene, records, grid.view, mi.Float(grid.column) + 0.5, mi.Float(grid.row) + 0.5, grid.size)
     covered = hits.triangle != MISS
-    pixel = pixel_index(hits, rows)
+    pixel = pixel_index(hits, grid.rows)
     if edges is None or edge_samples <= 1:
         index = dr.compress(covered)
         if dr.width(index) == 0:
@@ -133,7 +128,7 @@ def _camera_samples(
     dr.eval(hits, pixel, on_edge)
     index = dr.compress(covered & ~on_edge)
     plain = rays.keep(hits, index)
-    fine = _fine_samples(scene, records, hits, dr.compress(on_edge), size, edge_samples)
+    fine = _fine_samples(scene, records, hits, dr.compress(on_edge), grid.size, edge_samples)
     samples = _concat(plain, fine)
     weight = dr.concat(
         [dr.full(mi.Float, 1, dr.width(index)), dr.full(mi.Float, 1 / edge_samples, dr.width(fine.triangle))]
@@ -141,7 +136,7 @@ def _camera_samples(
     if dr.width(samples.triangle) == 0:
         return None, None, None
     dr.eval(samples, weight)
-    return samples, pixel_index(samples, rows), weight
+    return samples, pixel_index(samples, grid.rows), weight
 
 
 def _fine_samples(

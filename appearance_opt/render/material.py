@@ -1,7 +1,7 @@
 """From packed texels to material parameters.
 
-A ``MaterialMaps`` names the channels of its texels; what is not among them is a constant of the job:
-it has no texture, no gradient and no lookup.
+The layers of a ``MaterialMaps`` name the channels of their texels; what is not among them is a constant
+of the job: it has no texture, no gradient and no lookup.
 """
 
 from __future__ import annotations
@@ -28,36 +28,39 @@ follows from unit length."""
 DEFAULTS = {"red": 0.5, "green": 0.5, "blue": 0.5, "roughness": 0.5, "metalness": 0.0}
 
 
-@dataclass
-class MaterialMaps:
-    """``channels``: the name of each channel of ``pyramid``'s texels (padding has no name).
-    ``constants``: values of channels without a texture."""
+@dataclass(frozen=True)
+class TexelLayer:
+    """Packed maps in one pyramid. ``channels``: the name of each channel of its texels, in order
+    (padding has no name)."""
 
-    channels: tuple[str, ...] = ()
-    pyramid: Pyramid | None = None
+    channels: tuple[str, ...]
+    pyramid: Pyramid
+
+    def with_texels(self, texels: mi.Float) -> TexelLayer:
+        """The same layer around other texels."""
+        return TexelLayer(self.channels, self.pyramid.with_texels(texels))
+
+
+@dataclass(frozen=True)
+class MaterialMaps:
+    """Everything that is known of the materials of a surface: ``layers`` of maps (a fit keeps the maps
+    that move and those that do not in different layers) and ``constants`` for the channels without one."""
+
+    layers: tuple[TexelLayer, ...] = ()
     constants: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def has_normal_map(self) -> bool:
-        return "normal_x" in self.channels
-
-    @property
-    def material_count(self) -> int:
-        return len(self.pyramid.layout.sizes) if self.pyramid is not None else 1
-
-    def replace_texels(self, texels: mi.Float) -> MaterialMaps:
-        """The same maps with other texels."""
-        assert self.pyramid is not None
-        return MaterialMaps(self.channels, self.pyramid.replace(texels), self.constants)
+        return any("normal_x" in layer.channels for layer in self.layers)
 
 
-def evaluate(maps: MaterialMaps, hit: Hit, active: mi.Bool | None = None) -> MaterialSample:
+def evaluate(maps: MaterialMaps, hit: Hit) -> MaterialSample:
     """Material at each hit."""
     value: dict[str, mi.Float] = {k: mi.Float(v) for k, v in {**DEFAULTS, **maps.constants}.items()}
-    if maps.pyramid is not None and hit.uv is not None:
-        material = hit.material if maps.material_count > 1 else None
-        texel = maps.pyramid.lookup(material, hit.uv, hit.footprint, mi.Bool(True) if active is None else active)
-        value.update(zip(maps.channels, texel, strict=False))
+    for layer in maps.layers:
+        material = hit.material if len(layer.pyramid.layout.sizes) > 1 else None
+        texel = layer.pyramid.lookup(material, hit.uv, hit.footprint)
+        value.update(zip(layer.channels, texel, strict=False))
     base = mi.Color3f(value["red"], value["green"], value["blue"])
     if hit.color is not None:
         base *= hit.color

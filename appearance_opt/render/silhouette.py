@@ -27,6 +27,8 @@ from appearance_opt.render.rays import Samples
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from appearance_opt.render.deferred import Grid
+
 OFFSET = 1e-3
 """Distance in pixels of the two rays from the edge."""
 
@@ -122,21 +124,22 @@ def sample_edges(
     edges: EdgeList,
     vertices: mi.Float,
     records: mi.Float,
-    views: int,
-    resolution: int,
+    grid: Grid,
     density: float,
     seed: int,
 ) -> EdgeSamples | None:
     """Visible silhouette points, about ``density`` per pixel of projected length; None if there are
     none. Stratified along the total length; ``seed`` moves the points within their strata."""
-    size = dr.opaque(mi.Float, resolution)
-    index, length = silhouette_edges(edges, vertices, records, views, size)
+    size = grid.size
+    index, length = silhouette_edges(edges, vertices, records, grid.views, size)
     if dr.width(index) == 0:
         return None
     upper = dr.cumsum(length)
     total = float(upper[dr.width(upper) - 1])
     count = min(max(int(total * density), 1), MAX_SAMPLES)
-    points = _points(edges, vertices, records, size, index, upper, dr.opaque(mi.Float, total), count, seed)
+    points = _points(
+        edges, vertices, records, size, grid.views, index, upper, dr.opaque(mi.Float, total), count, seed
+    )
     x, y, depth = points[4], points[5], points[6]
     nx, ny = points[2], points[3]
     view = points[1]
@@ -151,8 +154,7 @@ def sample_edges(
     kept = dr.compress(visible)
     if dr.width(kept) == 0:
         return None
-    rows = dr.opaque(mi.UInt32, resolution)
-    pixel = (view * rows + mi.UInt32(y)) * rows + mi.UInt32(x)
+    pixel = (view * grid.rows + mi.UInt32(y)) * grid.rows + mi.UInt32(x)
 
     def pick(v: mi.Float | mi.UInt32) -> mi.Float | mi.UInt32:
         return dr.gather(type(v), v, kept)
@@ -176,6 +178,7 @@ def _points(
     vertices: mi.Float,
     records: mi.Float,
     resolution: mi.Float,
+    views: int,
     index: mi.UInt32,
     upper: mi.Float,
     total: mi.Float,
@@ -186,10 +189,7 @@ def _points(
     k = dr.arange(mi.UInt32, count)
     jitter = mi.sample_tea_float32(k, dr.opaque(mi.UInt32, seed))
     at = (mi.Float(k) + jitter) * (total / dr.opaque(mi.Float, count))
-    last = dr.width(upper) - 1
-    found = dr.binary_search(
-        mi.UInt32(0), dr.opaque(mi.UInt32, last), lambda j: dr.gather(mi.Float, upper, j) < at
-    )
+    found = _first_not_below(upper, at, views * edges.count)
     pair = dr.gather(mi.UInt32, index, found)
     begin = dr.gather(mi.Float, upper, found - 1, found > 0)
     s = (at - begin) / (dr.gather(mi.Float, upper, found) - begin)
@@ -208,6 +208,19 @@ def _points(
     x, y = dr.lerp(ax, bx, s), dr.lerp(ay, by, s)
     depth = dr.rcp(dr.lerp(dr.rcp(az), dr.rcp(bz), s))
     return edge, view, nx * scale, ny * scale, x, y, depth, s
+
+
+def _first_not_below(ascending: mi.Float, value: mi.Float, longest: int) -> mi.UInt32:
+    """Index of the first entry >= value (the last entry if there is none). The number of bisections
+    follows from the ``longest`` possible array, so that one kernel serves all lengths."""
+    last = dr.opaque(mi.UInt32, dr.width(ascending) - 1)
+    found = dr.zeros(mi.UInt32, dr.width(value))
+    for bit in reversed(range(longest.bit_length())):
+        candidate = found + (1 << bit)
+        inside = candidate <= last
+        below = dr.gather(mi.Float, ascending, candidate - 1, inside) < value
+        found = dr.select(inside & below, candidate, found)
+    return found
 
 
 def motion(

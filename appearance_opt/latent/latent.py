@@ -1,0 +1,99 @@
+"""The latent: fixed connectivity, an atlas, and the parameters of the job on the device."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from appearance_opt.latent import mesh_ops
+from appearance_opt.latent.mesh_ops import Corners
+from appearance_opt.render import upload
+from appearance_opt.render.silhouette import edge_list
+from appearance_opt.render.surface import Surface
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+
+@dataclass(frozen=True)
+class LatentMesh:
+    """Host description of a latent: V welded vertices, F faces, and its atlas.
+
+    ``positions`` (V, 3); ``faces`` (F, 3) into them; ``frame_vertex`` (R,): the vertex of each render
+    vertex; ``frame_faces`` (F, 3) into the render vertices; ``uvs`` (R, 2). Render vertices are split at
+    UV seams and where the handedness of the mapping changes.
+    """
+
+    positions: NDArray[np.float32]
+    faces: NDArray[np.int32]
+    frame_vertex: NDArray[np.int32]
+    frame_faces: NDArray[np.int32]
+    uvs: NDArray[np.float32]
+
+
+class LatentTopology:
+    """Everything about a latent that never changes during a fit, precomputed once."""
+
+    def __init__(self, mesh: LatentMesh, tangents: bool) -> None:
+        self.mesh = mesh
+        self.tangents = tangents
+        corner = [mi.UInt32(np.ascontiguousarray(mesh.faces[:, k], np.uint32)) for k in range(3)]
+        frame = [mi.UInt32(np.ascontiguousarray(mesh.frame_faces[:, k], np.uint32)) for k in range(3)]
+        self.corners = Corners(
+            vertex=(corner[0], corner[1], corner[2]),
+            frame=(frame[0], frame[1], frame[2]),
+            frame_vertex=mi.UInt32(np.ascontiguousarray(mesh.frame_vertex, np.uint32)),
+            uvs=mi.Float(np.ascontiguousarray(mesh.uvs, np.float32).ravel()),
+        )
+        self.faces = upload.index_packets(mesh.faces)
+        self.frame_faces = upload.index_packets(mesh.frame_faces)
+        self.edges = edge_list(mesh.faces)
+        self.handedness = mi.Float(handedness(mesh))
+
+    def surface(self, positions: mi.Float) -> Surface:
+        """Surface of flat positions (3 V); differentiable in them."""
+        p = dr.gather(mi.Point3f, positions, dr.arange(mi.UInt32, len(self.mesh.positions)))
+        normals = mesh_ops.vertex_normals(positions, self.corners)
+        vertices = _interleave(p.x, p.y, p.z, mi.Float(0), normals.x, normals.y, normals.z, mi.Float(0))
+        uv = dr.unravel(mi.Point2f, self.corners.uvs)
+        if self.tangents:
+            t = mesh_ops.tangent_frames(positions, normals, self.corners)
+            frames = _interleave(uv.x, uv.y, self.handedness, mi.Float(0), t.x, t.y, t.z, mi.Float(0))
+        else:
+            frames = self.corners.uvs
+        dr.eval(vertices, frames)
+        return Surface(self.faces, vertices, self.frame_faces, frames, None, self.tangents)
+
+
+def handedness(mesh: LatentMesh) -> NDArray[np.float32]:
+    """(R,) sign of the bitangent of each render vertex: +1 where v, which grows downward, makes the
+    mapping mirror-free (glTF's convention), -1 where the UVs are mirrored."""
+    uv = mesh.uvs[mesh.frame_faces]
+    a, b = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
+    sign = np.where(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0] > 0, -1.0, 1.0)
+    out = np.ones(len(mesh.uvs), np.float32)
+    out[mesh.frame_faces.ravel()] = np.repeat(sign, 3)
+    return out
+
+
+def local_edge_length(positions: NDArray, faces: NDArray) -> NDArray[np.float32]:
+    """(V,) mean length of the edges around each vertex; the mesh's mean for vertices without one."""
+    length = np.zeros(len(positions))
+    count = np.zeros(len(positions))
+    for a, b in ((0, 1), (1, 2), (2, 0)):
+        i, j = faces[:, a], faces[:, b]
+        edge = np.linalg.norm(positions[i].astype(np.float64) - positions[j], axis=1)
+        for k in (i, j):
+            length += np.bincount(k, edge, len(positions))
+            count += np.bincount(k, minlength=len(positions))
+    used = count > 0
+    mean = length[used].sum() / max(count[used].sum(), 1)
+    return np.where(used, length / np.maximum(count, 1), mean).astype(np.float32)
+
+
+def _interleave(*columns: mi.Float) -> mi.Float:
+    return dr.ravel(mi.ArrayXf(list(columns)), order="F")

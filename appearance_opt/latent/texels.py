@@ -1,0 +1,111 @@
+"""Fitted maps: packed texels, their encoding, and the mip pyramid that the renderer reads.
+
+Colours are stored as the square root of linear values, so that a step of the optimiser means about the same
+to the eye in dark and in light regions; everything else is stored as it is.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from appearance_opt.render.material import TexelLayer
+from appearance_opt.render.texture import CLAMP, Pyramid, downsample, pyramid_layout
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from numpy.typing import NDArray
+
+COLORS = ("red", "green", "blue")
+BOUNDS = {
+    **{c: (0.0, 1.0) for c in COLORS},
+    "roughness": (0.08, 1.0),
+    "metalness": (0.0, 1.0),
+    "gamma": (0.0, 1.0),
+    "normal_x": (-1.0, 1.0),
+    "normal_y": (-1.0, 1.0),
+    "normal_z": (0.05, 1.0),
+}
+MAX_LEVELS = 7
+"""Levels of a fitted pyramid: no view minifies an atlas by more than 2^6."""
+
+
+class TexelCodec:
+    """Shape and encoding of one packed, square, clamped texture of ``size`` texels (a power of two)."""
+
+    def __init__(self, channels: tuple[str, ...], size: int) -> None:
+        self.channels = channels
+        self.size = size
+        self.packed = 1 << (len(channels) - 1).bit_length()
+        self.layout = pyramid_layout([(size, size)], self.packed, [CLAMP], MAX_LEVELS)
+        self._template = Pyramid(self.layout, mi.Float(0))
+        self._is_color = [c in COLORS for c in channels] + [False] * (self.packed - len(channels))
+
+    def encode(self, maps: Mapping[str, NDArray]) -> mi.Float:
+        """Stored values of maps in natural units: channel name -> (size, size)."""
+        out = np.zeros((self.size, self.size, self.packed), np.float32)
+        for k, name in enumerate(self.channels):
+            low, high = BOUNDS[name]
+            value = np.clip(maps[name], low, high)
+            out[..., k] = np.sqrt(value) if name in COLORS else value
+        return mi.Float(out.ravel())
+
+    def decode(self, stored: mi.Float) -> mi.Float:
+        """Natural (linear) values of all texels, flat packets."""
+        rows = self._rows(stored)
+        return _flat([dr.square(t) if c else t for t, c in zip(rows, self._is_color, strict=True)])
+
+    def layer(self, stored: mi.Float) -> TexelLayer:
+        """Pyramid of the stored values, ready for the renderer. Not differentiated: see ``pull_back``."""
+        with dr.suspend_grad():
+            level = self.decode(stored)
+            levels = [level]
+            for size in self.layout.sizes[0][:-1]:
+                level = downsample(level, size, self.packed)
+                levels.append(level)
+            texels = levels[0] if len(levels) == 1 else dr.concat(levels)
+            dr.eval(texels)
+        return TexelLayer(self.channels, self._template.with_texels(texels))
+
+    def pull_back(self, gradient: mi.Float, stored: mi.Float) -> mi.Float:
+        """Gradient for the stored values from the gradient of all levels of the pyramid: each level
+        hands a quarter of its gradient to its four children, then the encoding's chain rule."""
+        sizes, offsets = self.layout.sizes[0], self.layout.offsets[0]
+        total = None
+        for (width, height), offset in reversed(list(zip(sizes, offsets, strict=True))):
+            count = width * height
+            i = dr.arange(mi.UInt32, count)
+            own = dr.gather(mi.ArrayXf, gradient, i + offset, shape=(self.packed, count))
+            if total is not None:
+                y = i // width
+                parent = (y // 2) * ((width + 1) // 2) + (i - y * width) // 2
+                own += 0.25 * dr.gather(mi.ArrayXf, total, parent, shape=(self.packed, count))
+            if width != self.size:
+                total = _flat(list(own))
+        texel = self._rows(stored)
+        return _flat([g * (2 * t) if c else g for g, t, c in zip(own, texel, self._is_color, strict=True)])
+
+    def to_maps(self, stored: mi.Float) -> dict[str, NDArray[np.float32]]:
+        """Natural values on the host: channel name -> (size, size)."""
+        texels = np.array(stored).reshape(self.size, self.size, self.packed)
+        return {n: texels[..., k] ** 2 if n in COLORS else texels[..., k] for k, n in enumerate(self.channels)}
+
+    def per_channel(self, values: Mapping[str, float]) -> mi.Float:
+        """One number per packed channel (0 for padding)."""
+        return mi.Float([values[c] for c in self.channels] + [0.0] * (self.packed - len(self.channels)))
+
+    def _rows(self, stored: mi.Float) -> mi.ArrayXf:
+        n = self.size * self.size
+        return dr.gather(mi.ArrayXf, stored, dr.arange(mi.UInt32, n), shape=(self.packed, n))
+
+
+def _flat(rows: list[mi.Float]) -> mi.Float:
+    """Interleave channels into packets."""
+    n = dr.width(rows[0])
+    out = dr.empty(mi.Float, n * len(rows))
+    dr.scatter(out, mi.ArrayXf(rows), dr.arange(mi.UInt32, n), mode=dr.ReduceMode.Permute)
+    return out
