@@ -41,6 +41,11 @@ class Views:
     def __getitem__(self, index: slice | NDArray | list[int]) -> Views:
         return Views(*(getattr(self, f)[index] for f in self.__dataclass_fields__))
 
+    @staticmethod
+    def concatenate(parts: list[Views]) -> Views:
+        """Several batches as one."""
+        return Views(*(np.concatenate([getattr(p, f) for p in parts]) for f in Views.__dataclass_fields__))
+
     def records(self) -> mi.Float:
         """Upload: B records of ``RECORD`` floats."""
         import mitsuba as mi

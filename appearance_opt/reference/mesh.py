@@ -10,7 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 from appearance_opt.asset.normals import vertex_normals
-from appearance_opt.asset.tangents import split_and_tangents
+from appearance_opt.asset.tangents import any_tangent, split_and_tangents
 from appearance_opt.reference.textures import material_maps
 from appearance_opt.render import deferred, upload
 from appearance_opt.render.deferred import Grid
@@ -114,16 +114,8 @@ def _complete(mesh: Mesh, need_tangents: bool, need_colors: bool) -> MergedMesh:
     tangents = mesh.tangents
     if need_tangents and tangents is None:
         if mesh.material.normal_texture is None or mesh.uvs is None:
-            tangents = _any_tangent(normals)
+            tangents = np.concatenate([any_tangent(normals), np.ones((len(normals), 1))], axis=1).astype(np.float32)
         else:
             index, faces, tangents = split_and_tangents(positions, normals, uvs, faces)
             positions, normals, uvs, colors = positions[index], normals[index], uvs[index], colors[index]
     return MergedMesh(positions, normals, uvs, tangents, colors if need_colors else None, faces, np.empty(0, np.int32))
-
-
-def _any_tangent(normals: NDArray) -> NDArray[np.float32]:
-    """Some unit tangent (V, 4) for meshes whose normal map is flat: which one does not matter."""
-    axis = np.where(np.abs(normals[:, :1]) < 0.9, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
-    t = np.cross(normals, axis)
-    t /= np.maximum(np.linalg.norm(t, axis=1, keepdims=True), 1e-20)
-    return np.concatenate([t, np.ones((len(t), 1))], axis=1).astype(np.float32)

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from appearance_opt.asset.packing import resized
 from appearance_opt.render.material import MaterialMaps, TexelLayer
 from appearance_opt.render.texture import CLAMP, MIRROR, REPEAT, build_pyramid
 
@@ -50,30 +51,14 @@ def _packed(m: Material, with_normals: bool) -> NDArray[np.float32]:
     out[..., 4] = m.metalness
     out[..., 7] = 1.0 if with_normals else 0.0
     if m.base_color_texture is not None:
-        texture = _resized(m.base_color_texture.linear(), height, width)
+        texture = resized(m.base_color_texture.linear(), height, width)
         out[..., :3] *= texture[..., :3] if texture.shape[2] >= 3 else texture[..., :1]
     if m.orm_texture is not None:
-        texture = _resized(m.orm_texture.linear(), height, width)
+        texture = resized(m.orm_texture.linear(), height, width)
         out[..., 3] *= texture[..., 1]
         out[..., 4] *= texture[..., 2]
     if m.normal_texture is not None:
-        texture = _resized(m.normal_texture.linear(), height, width)
+        texture = resized(m.normal_texture.linear(), height, width)
         out[..., 5:8] = texture[..., :3] * 2 - 1
         out[..., 5:7] *= m.normal_scale
     return out
-
-
-def _resized(pixels: NDArray[np.float32], height: int, width: int) -> NDArray[np.float32]:
-    """Bilinear enlargement with texel centres at (i + 0.5) / size."""
-    if pixels.shape[:2] == (height, width):
-        return pixels
-    for axis, size in ((0, height), (1, width)):
-        old = pixels.shape[axis]
-        at = np.clip((np.arange(size) + 0.5) * old / size - 0.5, 0, old - 1)
-        lower = np.floor(at).astype(np.intp)
-        upper = np.minimum(lower + 1, old - 1)
-        shape = [1, 1, 1]
-        shape[axis] = size
-        fraction = (at - lower).astype(np.float32).reshape(shape)
-        pixels = pixels.take(lower, axis) * (1 - fraction) + pixels.take(upper, axis) * fraction
-    return pixels

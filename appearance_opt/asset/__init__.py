@@ -1,0 +1,82 @@
+"""Host-side data and the only doors to disk: ``load`` and ``save``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from appearance_opt.asset.types import Asset, Material, Mesh, Texture
+from appearance_opt.errors import InputError
+
+__all__ = ["Asset", "Material", "Mesh", "Texture", "load", "save"]
+
+READABLE = (".glb", ".gltf", ".usd", ".usda", ".usdc", ".usdz", ".obj", ".ply", ".stl")
+WRITABLE = (".glb", ".gltf", ".usd", ".usda", ".usdc", ".usdz", ".obj")
+
+
+def load(path: str | Path, *, subdivision: int = 1) -> Asset:
+    """Read an asset; the suffix chooses the format. Units become metres, the up axis +Y.
+
+    ``subdivision``: level to which USD subdivision surfaces are refined. Harmless faults are repaired
+    and noted in ``Asset.notes``. Raises InputError for everything else, naming the file.
+    """
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if suffix not in READABLE:
+        raise InputError(f"{path}: unknown format '{suffix}'; readable are {' '.join(READABLE)}")
+    if not path.is_file():
+        raise InputError(f"{path}: no such file")
+    from appearance_opt.asset.validate import repair
+
+    return repair(_read(path, suffix, subdivision), str(path))
+
+
+def _read(path: Path, suffix: str, subdivision: int) -> Asset:
+    if suffix in (".glb", ".gltf"):
+        from appearance_opt.asset.gltf_read import load_gltf
+
+        return load_gltf(path)
+    if suffix == ".obj":
+        from appearance_opt.asset.obj import load_obj
+
+        return load_obj(path)
+    if suffix in (".ply", ".stl"):
+        from appearance_opt.asset.geometry import load_geometry
+
+        return load_geometry(path)
+    from appearance_opt.asset.usd_read import load_usd
+
+    return load_usd(path, subdivision)
+
+
+def save(asset: Asset, path: str | Path) -> None:
+    """Write an asset; the suffix chooses the format. Written under a temporary name, then renamed.
+    Raises InputError for a format that cannot be written, OSError when the disk refuses."""
+    path = Path(path)
+    check_writable(path)
+    suffix = path.suffix.lower()
+    if suffix in (".glb", ".gltf"):
+        from appearance_opt.asset.gltf_write import save_gltf
+
+        save_gltf(asset, path)
+    elif suffix == ".obj":
+        from appearance_opt.asset.obj import save_obj
+
+        save_obj(asset, path)
+    else:
+        from appearance_opt.asset.usd_write import save_usd
+
+        save_usd(asset, path)
+
+
+def check_writable(path: Path) -> None:
+    """Raise InputError if the format of ``path`` cannot be written, or its folder not be used."""
+    suffix = path.suffix.lower()
+    if suffix not in WRITABLE:
+        raise InputError(f"{path}: cannot write '{suffix}' files; choose one of {' '.join(WRITABLE)}")
+    if path.is_dir():
+        raise InputError(f"{path}: is a folder; name a file in it")
+    folder = path.parent
+    while not folder.exists() and folder != folder.parent:
+        folder = folder.parent
+    if not folder.is_dir():
+        raise InputError(f"{path}: '{folder}' is not a folder")

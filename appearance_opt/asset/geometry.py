@@ -1,0 +1,40 @@
+"""PLY and STL: geometry alone, through trimesh."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from appearance_opt.asset.normals import weld
+from appearance_opt.asset.paths import read_bytes
+from appearance_opt.asset.types import Asset, Material, Mesh, srgb_to_linear
+from appearance_opt.errors import InputError
+
+
+def load_geometry(path: Path) -> Asset:
+    """Read a .ply or .stl file (vertices at the same place welded, for STL has no shared ones). Raises
+    InputError."""
+    import io
+
+    import trimesh
+
+    path = Path(path)
+    data = read_bytes(path)
+    kind = path.suffix.lower().lstrip(".")
+    try:
+        loaded = trimesh.load(io.BytesIO(data), file_type=kind, process=False, force="mesh")
+    except Exception as error:  # trimesh's readers raise anything on damaged files
+        raise InputError(f"{path}: not a readable {kind.upper()} file ({type(error).__name__})") from error
+    if not isinstance(loaded, trimesh.Trimesh) or not len(loaded.faces):
+        raise InputError(f"{path}: there are no triangles in it")
+    positions = np.asarray(loaded.vertices, np.float32)
+    faces = np.asarray(loaded.faces, np.int32)
+    colors = None
+    if loaded.visual.kind == "vertex":
+        colors = srgb_to_linear(np.asarray(loaded.visual.vertex_colors[:, :3], np.float32) / np.float32(255))
+    if kind == "stl":
+        first, place = weld(positions)
+        positions, faces, colors = positions[first], place[faces].astype(np.int32), None
+    mesh = Mesh(positions, faces, colors=colors, material=Material(name=path.stem, roughness=0.8), name=path.stem)
+    return Asset((mesh,), path.stem, ("no material in this format: a default one is used",))

@@ -1,0 +1,124 @@
+"""glTF 2.0 buffers and accessors (specification, section 3.6)."""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import json
+import struct
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from appearance_opt.asset.paths import read_bytes, resolve
+from appearance_opt.errors import InputError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+COMPONENTS = {5120: np.int8, 5121: np.uint8, 5122: np.int16, 5123: np.uint16, 5125: np.uint32, 5126: np.float32}
+WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
+_MAGIC, _JSON, _BIN = 0x46546C67, 0x4E4F534A, 0x004E4942
+
+
+class Document:
+    """A parsed glTF or GLB file: its JSON, and its buffers, read when asked for."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = Path(path)
+        data = read_bytes(self.path)
+        text, self._binary = _chunks(data, self.path) if data[:4] == b"glTF" else (data, None)
+        try:
+            self.json: dict[str, Any] = json.loads(text)
+        except ValueError as error:
+            raise InputError(f"{path}: not a glTF file, or cut short ({error})") from None
+        if not isinstance(self.json, dict) or "asset" not in self.json:
+            raise InputError(f"{path}: not a glTF file (no 'asset' object)")
+        if not str(self.json["asset"].get("version", "")).startswith("2"):
+            raise InputError(f"{path}: glTF version {self.json['asset'].get('version')} is not supported; convert to 2.0")
+        self._buffers: dict[int, bytes] = {}
+
+    def items(self, kind: str) -> list[dict[str, Any]]:
+        """A top-level array of the JSON, empty when absent."""
+        return self.json.get(kind, [])
+
+    def uri(self, uri: str) -> bytes:
+        """Bytes behind a data URI or a path relative to the file."""
+        if uri.startswith("data:"):
+            try:
+                return base64.b64decode(uri.split(",", 1)[1], validate=True)
+            except (IndexError, binascii.Error):
+                raise InputError(f"{self.path}: a data URI is damaged") from None
+        return read_bytes(resolve(uri, self.path, percent_encoded=True))
+
+    def buffer_view(self, index: int) -> tuple[bytes, int]:
+        """(bytes, stride or 0) of a buffer view."""
+        view = self.items("bufferViews")[index]
+        data = self._buffer(view["buffer"])
+        start, length = view.get("byteOffset", 0), view["byteLength"]
+        if start < 0 or length < 0 or start + length > len(data):
+            raise InputError(f"{self.path}: buffer view {index} reaches beyond its buffer; the file is cut short")
+        return data[start : start + length], view.get("byteStride", 0)
+
+    def accessor(self, index: int) -> NDArray:
+        """(count, width) array: floats for float and normalized types, integers otherwise."""
+        a = self.items("accessors")[index]
+        kind, width, count = np.dtype(COMPONENTS[a["componentType"]]), WIDTHS[a["type"]], a["count"]
+        out = np.zeros((count, width), kind)
+        if "bufferView" in a:
+            out = self._elements(a["bufferView"], a.get("byteOffset", 0), kind, width, count)
+        if "sparse" in a:
+            s = a["sparse"]
+            at = s["indices"]
+            where = self._elements(
+                at["bufferView"], at.get("byteOffset", 0), np.dtype(COMPONENTS[at["componentType"]]), 1, s["count"]
+            )
+            out = out.copy()
+            out[where[:, 0]] = self._elements(
+                s["values"]["bufferView"], s["values"].get("byteOffset", 0), kind, width, s["count"]
+            )
+        if a.get("normalized") and kind.kind != "f":
+            return np.maximum(out.astype(np.float32) / np.float32(np.iinfo(kind).max), -1)
+        return out
+
+    def _elements(self, view: int, offset: int, kind: np.dtype, width: int, count: int) -> NDArray:
+        data, stride = self.buffer_view(view)
+        stride = stride or kind.itemsize * width
+        if count < 0 or offset < 0 or (count and offset + stride * (count - 1) + kind.itemsize * width > len(data)):
+            raise InputError(f"{self.path}: an accessor reaches beyond its buffer view; the file is cut short")
+        return np.ndarray((count, width), kind.newbyteorder("<"), data, offset, (stride, kind.itemsize))
+
+    def _buffer(self, index: int) -> bytes:
+        if index not in self._buffers:
+            buffer = self.items("buffers")[index]
+            if "uri" in buffer:
+                self._buffers[index] = self.uri(buffer["uri"])
+            elif self._binary is not None and index == 0:
+                self._buffers[index] = self._binary
+            else:
+                raise InputError(f"{self.path}: buffer {index} has no data")
+        return self._buffers[index]
+
+
+def _chunks(data: bytes, path: Path) -> tuple[bytes, bytes | None]:
+    """(JSON, binary chunk) of a GLB file."""
+    if len(data) < 20:
+        raise InputError(f"{path}: the GLB file is cut short ({len(data)} bytes)")
+    _, _, length = struct.unpack_from("<III", data)
+    if length > len(data):
+        raise InputError(f"{path}: the GLB file is cut short ({len(data)} of {length} bytes)")
+    text, binary, offset = None, None, 12
+    while offset + 8 <= length:
+        size, kind = struct.unpack_from("<II", data, offset)
+        chunk = data[offset + 8 : offset + 8 + size]
+        if len(chunk) < size:
+            raise InputError(f"{path}: a chunk of the GLB file is cut short")
+        if kind == _JSON and text is None:
+            text = chunk
+        elif kind == _BIN and binary is None:
+            binary = chunk
+        offset += 8 + size
+    if text is None:
+        raise InputError(f"{path}: the GLB file has no JSON chunk")
+    return text, binary

@@ -1,0 +1,250 @@
+"""glTF 2.0 and GLB to an Asset."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from appearance_opt.asset import images
+from appearance_opt.asset.gltf_accessors import Document
+from appearance_opt.asset.types import Asset, Material, Mesh, Texture, Wrap
+from appearance_opt.errors import InputError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+_WRAPS: dict[int, Wrap] = {10497: "repeat", 33071: "clamp", 33648: "mirror"}
+_COMPRESSED = {
+    "KHR_draco_mesh_compression": "Draco",
+    "EXT_meshopt_compression": "meshopt",
+    "KHR_texture_basisu": "Basis Universal",
+}
+_HARMLESS = {"KHR_mesh_quantization", "KHR_texture_transform", "EXT_texture_webp"}
+
+
+def load_gltf(path: Path) -> Asset:
+    """Read a .gltf or .glb file. Raises InputError."""
+    document = Document(path)
+    try:
+        return _Reader(document).asset()
+    except (KeyError, IndexError, TypeError, AttributeError, ValueError, OverflowError, RecursionError) as error:
+        raise InputError(f"{path}: the glTF structure is broken ({type(error).__name__}: {error})") from error
+
+
+class _Reader:
+    def __init__(self, document: Document) -> None:
+        self.document = document
+        self.path = document.path
+        self.notes: list[str] = []
+        self._images: dict[int, NDArray] = {}
+        self._materials: dict[int | None, Material] = {}
+
+    def asset(self) -> Asset:
+        self._check_extensions()
+        json = self.document.json
+        roots = range(len(self.document.items("nodes")))
+        if self.document.items("scenes"):
+            roots = self.document.items("scenes")[json.get("scene", 0)].get("nodes", [])
+        meshes: list[Mesh] = []
+        for root in roots:
+            self._visit(root, np.eye(4), meshes, set())
+        for kind, what in (("skins", "skins (bind pose kept)"), ("animations", "animations")):
+            if self.document.items(kind):
+                self._note(f"{what} ignored")
+        return Asset(tuple(meshes), self.path.stem, tuple(self.notes))
+
+    def _note(self, text: str) -> None:
+        if text not in self.notes:
+            self.notes.append(text)
+
+    def _check_extensions(self) -> None:
+        for name in self.document.json.get("extensionsRequired", []):
+            if name in _COMPRESSED:
+                raise InputError(
+                    f"{self.path}: {_COMPRESSED[name]} compression is not supported; save it uncompressed first"
+                )
+        for name in self.document.json.get("extensionsUsed", []):
+            if name not in _HARMLESS:
+                self._note(f"extension {name} ignored")
+
+    def _visit(self, index: int, parent: NDArray, meshes: list[Mesh], seen: set[int]) -> None:
+        if index in seen:
+            raise InputError(f"{self.path}: node {index} is its own ancestor")
+        node = self.document.items("nodes")[index]
+        world = parent @ _local_transform(node)
+        if "mesh" in node:
+            mesh = self.document.items("meshes")[node["mesh"]]
+            name = node.get("name") or mesh.get("name") or f"mesh{node['mesh']}"
+            for k, primitive in enumerate(mesh["primitives"]):
+                part = self._primitive(primitive, world, name if k == 0 else f"{name}.{k}")
+                if part is not None:
+                    meshes.append(part)
+        for child in node.get("children", []):
+            self._visit(child, world, meshes, seen | {index})
+
+    def _primitive(self, primitive: dict[str, Any], world: NDArray, name: str) -> Mesh | None:
+        mode = primitive.get("mode", 4)
+        if mode not in (4, 5, 6):
+            self._note("points and lines ignored")
+            return None
+        if primitive.get("targets"):
+            self._note("morph targets ignored")
+        attributes = primitive["attributes"]
+        read = self.document.accessor
+        positions = read(attributes["POSITION"])[:, :3].astype(np.float64)
+        indices = read(primitive["indices"])[:, 0] if "indices" in primitive else np.arange(len(positions))
+        faces = _triangles(indices.astype(np.int64), mode)
+        linear = world[:3, :3]
+        if np.linalg.det(linear) < 0:
+            faces = faces[:, ::-1]
+        normals = tangents = colors = None
+        if "NORMAL" in attributes:
+            normals = _normalized(read(attributes["NORMAL"]).astype(np.float64) @ _cofactor(linear).T)
+        if "TANGENT" in attributes and normals is not None:
+            t = read(attributes["TANGENT"]).astype(np.float64)
+            tangents = np.concatenate([_normalized(t[:, :3] @ linear.T), np.where(t[:, 3:4] < 0, -1, 1)], axis=1)
+        if "COLOR_0" in attributes:
+            colors = read(attributes["COLOR_0"])[:, :3].astype(np.float32)
+        material, channel = self._material(primitive.get("material"))
+        uvs = read(attributes[f"TEXCOORD_{channel}"]) if f"TEXCOORD_{channel}" in attributes else None
+        return Mesh(
+            positions=(positions @ linear.T + world[:3, 3]).astype(np.float32),
+            faces=np.ascontiguousarray(faces, np.int32),
+            normals=_float(normals),
+            uvs=None if uvs is None else self._transformed(uvs.astype(np.float32), primitive.get("material")),
+            tangents=_float(tangents),
+            colors=colors,
+            material=material,
+            name=name,
+        )
+
+    def _texture_infos(self, index: int | None) -> list[dict[str, Any]]:
+        if index is None:
+            return []
+        m = self.document.items("materials")[index]
+        pbr = m.get("pbrMetallicRoughness", {})
+        infos = [pbr.get("baseColorTexture"), pbr.get("metallicRoughnessTexture"), m.get("normalTexture")]
+        return [i for i in infos if i is not None]
+
+    def _transformed(self, uvs: NDArray, material: int | None) -> NDArray[np.float32]:
+        """KHR_texture_transform, when all textures of the material share it."""
+        found = [i.get("extensions", {}).get("KHR_texture_transform") for i in self._texture_infos(material)]
+        if not any(found):
+            return uvs
+        if any(f != found[0] for f in found):
+            self._note("textures of one material differ in KHR_texture_transform: the first one is used for all")
+        t = next(f for f in found if f)
+        angle = t.get("rotation", 0.0)
+        u, v = (uvs * np.array(t.get("scale", (1, 1)))).T
+        c, s = np.cos(angle), np.sin(angle)
+        return (np.stack([c * u + s * v, -s * u + c * v], 1) + np.array(t.get("offset", (0, 0)))).astype(np.float32)
+
+    def _material(self, index: int | None) -> tuple[Material, int]:
+        """(material, index of the texture coordinates that its textures use)."""
+        infos = self._texture_infos(index)
+        channels = [
+            i.get("extensions", {}).get("KHR_texture_transform", {}).get("texCoord", i.get("texCoord", 0)) for i in infos
+        ]
+        if len(set(channels)) > 1:
+            self._note("textures of one material use different texture coordinates: the first set is used for all")
+        if index not in self._materials:
+            self._materials[index] = Material() if index is None else self._read_material(index)
+        return self._materials[index], channels[0] if channels else 0
+
+    def _read_material(self, index: int) -> Material:
+        m = self.document.items("materials")[index]
+        pbr = m.get("pbrMetallicRoughness", {})
+        name = m.get("name", f"material{index}")
+        factor = [float(x) for x in pbr.get("baseColorFactor", (1, 1, 1, 1))]
+        if "occlusionTexture" in m:
+            self._note("occlusion ignored (it is not part of the appearance under a moving light)")
+        if "emissiveTexture" in m or any(m.get("emissiveFactor", ())):
+            self._note("emission ignored")
+        mode = {"MASK": "mask", "BLEND": "blend"}.get(m.get("alphaMode", "OPAQUE"), "opaque")
+        if mode != "opaque":
+            self._note(f"material '{name}': transparency ignored, drawn opaque")
+        normal = m.get("normalTexture")
+        return Material(
+            name=name,
+            base_color=(factor[0], factor[1], factor[2]),
+            roughness=float(pbr.get("roughnessFactor", 1.0)),
+            metalness=float(pbr.get("metallicFactor", 1.0)),
+            normal_scale=float(normal.get("scale", 1.0)) if normal else 1.0,
+            base_color_texture=self._texture(pbr.get("baseColorTexture"), "srgb", name),
+            orm_texture=self._texture(pbr.get("metallicRoughnessTexture"), "linear", name),
+            normal_texture=self._texture(normal, "linear", name),
+            opacity=factor[3],
+            alpha_mode=mode,  # type: ignore[arg-type]
+            alpha_cutoff=float(m.get("alphaCutoff", 0.5)),
+            double_sided=bool(m.get("doubleSided", False)),
+        )
+
+    def _texture(self, info: dict[str, Any] | None, space: str, material: str) -> Texture | None:
+        if info is None:
+            return None
+        texture = self.document.items("textures")[info["index"]]
+        webp = texture.get("extensions", {}).get("EXT_texture_webp", {})
+        source = texture.get("source", webp.get("source"))
+        if source is None:
+            raise InputError(f"{self.path}: a texture of material '{material}' has no image in a supported format")
+        if source not in self._images:
+            self._images[source] = self._image(source, material)
+        sampler = self.document.items("samplers")[texture["sampler"]] if "sampler" in texture else {}
+        wrap = (_WRAPS.get(sampler.get("wrapS"), "repeat"), _WRAPS.get(sampler.get("wrapT"), "repeat"))
+        pixels = self._images[source]
+        if pixels.shape[2] < 3:  # grey, or grey and alpha
+            pixels = np.repeat(pixels[..., :1], 3, axis=2)
+        return Texture(pixels, space, wrap)  # type: ignore[arg-type]
+
+    def _image(self, index: int, material: str) -> NDArray:
+        image = self.document.items("images")[index]
+        if "bufferView" in image:
+            data = self.document.buffer_view(image["bufferView"])[0]
+        else:
+            data = self.document.uri(image["uri"])
+        return images.decode(data, f"{self.path}, image {image.get('name') or index} of material '{material}'")
+
+
+def _local_transform(node: dict[str, Any]) -> NDArray:
+    if "matrix" in node:
+        return np.array(node["matrix"], np.float64).reshape(4, 4).T
+    x, y, z, w = (float(q) for q in node.get("rotation", (0, 0, 0, 1)))
+    out = np.eye(4)
+    rotation = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+    out[:3, :3] = rotation * np.array(node.get("scale", (1, 1, 1)), np.float64)
+    out[:3, 3] = node.get("translation", (0, 0, 0))
+    return out
+
+
+def _triangles(indices: NDArray, mode: int) -> NDArray:
+    """(F, 3) faces of a triangle list (4), strip (5) or fan (6)."""
+    if mode == 4:
+        return indices[: len(indices) // 3 * 3].reshape(-1, 3)
+    n = max(len(indices) - 2, 0)
+    if mode == 6:
+        return np.stack([np.repeat(indices[:1], n), indices[1 : n + 1], indices[2 : n + 2]], axis=1)
+    strip = np.stack([indices[:n], indices[1 : n + 1], indices[2 : n + 2]], axis=1)
+    strip[1::2] = strip[1::2, [1, 0, 2]]
+    return strip
+
+
+def _cofactor(m: NDArray) -> NDArray:
+    """Transforms normals, singular matrices included (inverse transpose times determinant, sign kept)."""
+    c = np.stack([np.cross(m[1], m[2]), np.cross(m[2], m[0]), np.cross(m[0], m[1])])
+    return c if np.linalg.det(m) >= 0 else -c
+
+
+def _normalized(v: NDArray) -> NDArray:
+    return v / np.maximum(np.linalg.norm(v, axis=1, keepdims=True), 1e-30)
+
+
+def _float(v: NDArray | None) -> NDArray[np.float32] | None:
+    return None if v is None else v.astype(np.float32)

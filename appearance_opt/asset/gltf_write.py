@@ -1,0 +1,182 @@
+"""An Asset to glTF 2.0: one GLB file, or .gltf with .bin and PNG files beside it."""
+
+from __future__ import annotations
+
+import json
+import struct
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from appearance_opt.asset import images
+from appearance_opt.asset.paths import replacing
+from appearance_opt.asset.types import linear_to_srgb
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from appearance_opt.asset.types import Asset, Material, Mesh, Texture
+
+_WRAPS = {"repeat": 10497, "clamp": 33071, "mirror": 33648}
+_ARRAY_BUFFER, _ELEMENT_BUFFER = 34962, 34963
+
+
+def save_gltf(asset: Asset, path: Path) -> None:
+    """Write .glb (one file) or .gltf (geometry in ``<stem>.bin``, textures in ``<stem>_<k>.png``)."""
+    path = Path(path)
+    writer = _Writer(asset)
+    if path.suffix.lower() == ".glb":
+        writer.embed_images()
+        with replacing(path) as temporary:
+            temporary.write_bytes(writer.glb())
+        return
+    for k, data in enumerate(writer.image_files):
+        with replacing(path.with_name(f"{path.stem}_{k}.png")) as temporary:
+            temporary.write_bytes(data)
+        writer.json["images"][k] = {"uri": f"{path.stem}_{k}.png"}
+    with replacing(path.with_suffix(".bin")) as temporary:
+        temporary.write_bytes(bytes(writer.binary))
+    writer.json["buffers"] = [{"uri": f"{path.stem}.bin", "byteLength": len(writer.binary)}]
+    with replacing(path) as temporary:
+        temporary.write_text(json.dumps(writer.json, indent=1))
+
+
+class _Writer:
+    """Collects the JSON and the binary buffer of a file."""
+
+    def __init__(self, asset: Asset) -> None:
+        self.binary = bytearray()
+        self.json: dict[str, Any] = {
+            "asset": {"version": "2.0", "generator": "appearance-opt"},
+            "scene": 0,
+            "scenes": [{"nodes": list(range(len(asset.meshes)))}],
+            "nodes": [{"mesh": k, "name": m.name} for k, m in enumerate(asset.meshes)],
+            "meshes": [],
+            "accessors": [],
+            "bufferViews": [],
+        }
+        self._textures: dict[int, int] = {}
+        self._samplers: list[dict[str, int]] = []
+        self._pending: list[Texture] = []
+        materials: dict[int, int] = {}
+        for mesh in asset.meshes:
+            if id(mesh.material) not in materials:
+                materials[id(mesh.material)] = len(materials)
+                self.json.setdefault("materials", []).append(self._material(mesh.material))
+            self.json["meshes"].append(self._mesh(mesh, materials[id(mesh.material)]))
+        with ThreadPoolExecutor() as pool:
+            self.image_files = list(pool.map(_png, self._pending))
+        if self._pending:
+            self.json["images"] = [{} for _ in self._pending]
+            self.json["samplers"] = self._samplers
+
+    def embed_images(self) -> None:
+        """Put the images into the binary buffer."""
+        for k, data in enumerate(self.image_files):
+            self.json["images"][k] = {"bufferView": self._view(data), "mimeType": "image/png"}
+
+    def glb(self) -> bytes:
+        """The whole file."""
+        self.json["buffers"] = [{"byteLength": len(self.binary)}]
+        text = json.dumps(self.json, separators=(",", ":")).encode()
+        text += b" " * (-len(text) % 4)
+        binary = bytes(self.binary) + b"\0" * (-len(self.binary) % 4)
+        head = struct.pack("<4sII", b"glTF", 2, 12 + 8 + len(text) + 8 + len(binary))
+        return b"".join(
+            [head, struct.pack("<I4s", len(text), b"JSON"), text, struct.pack("<I4s", len(binary), b"BIN\0"), binary]
+        )
+
+    def _view(self, data: bytes, target: int | None = None) -> int:
+        self.binary += b"\0" * (-len(self.binary) % 4)
+        view = {"buffer": 0, "byteOffset": len(self.binary), "byteLength": len(data)}
+        if target is not None:
+            view["target"] = target
+        self.binary += data
+        self.json["bufferViews"].append(view)
+        return len(self.json["bufferViews"]) - 1
+
+    def _attribute(self, values: NDArray, bounds: bool = False) -> int:
+        values = np.ascontiguousarray(values, np.float32)
+        accessor = {
+            "bufferView": self._view(values.tobytes(), _ARRAY_BUFFER),
+            "componentType": 5126,
+            "count": len(values),
+            "type": f"VEC{values.shape[1]}",
+        }
+        if bounds:
+            accessor["min"], accessor["max"] = values.min(axis=0).tolist(), values.max(axis=0).tolist()
+        self.json["accessors"].append(accessor)
+        return len(self.json["accessors"]) - 1
+
+    def _mesh(self, mesh: Mesh, material: int) -> dict[str, Any]:
+        attributes = {"POSITION": self._attribute(mesh.positions, bounds=True)}
+        if mesh.normals is not None:
+            attributes["NORMAL"] = self._attribute(_unit(mesh.normals))
+            if mesh.tangents is not None:
+                tangents = np.concatenate([_unit(mesh.tangents[:, :3]), mesh.tangents[:, 3:]], axis=1)
+                attributes["TANGENT"] = self._attribute(tangents)
+        if mesh.uvs is not None:
+            attributes["TEXCOORD_0"] = self._attribute(mesh.uvs)
+        if mesh.colors is not None:
+            attributes["COLOR_0"] = self._attribute(mesh.colors)
+        # the largest index of a type is reserved (primitive restart)
+        kind, code = (np.uint16, 5123) if len(mesh.positions) < 65535 else (np.uint32, 5125)
+        view = self._view(np.ascontiguousarray(mesh.faces, kind).tobytes(), _ELEMENT_BUFFER)
+        indices = {"bufferView": view, "componentType": code, "count": 3 * len(mesh.faces), "type": "SCALAR"}
+        self.json["accessors"].append(indices)
+        primitive = {"attributes": attributes, "indices": len(self.json["accessors"]) - 1, "material": material}
+        return {"name": mesh.name, "primitives": [primitive]}
+
+    def _material(self, m: Material) -> dict[str, Any]:
+        pbr: dict[str, Any] = {
+            "baseColorFactor": [*m.base_color, m.opacity],
+            "roughnessFactor": m.roughness,
+            "metallicFactor": m.metalness,
+        }
+        if m.base_color_texture is not None:
+            pbr["baseColorTexture"] = {"index": self._texture(m.base_color_texture)}
+        if m.orm_texture is not None:
+            pbr["metallicRoughnessTexture"] = {"index": self._texture(m.orm_texture)}
+        out: dict[str, Any] = {"name": m.name, "pbrMetallicRoughness": pbr, "doubleSided": m.double_sided}
+        if m.normal_texture is not None:
+            out["normalTexture"] = {"index": self._texture(m.normal_texture), "scale": m.normal_scale}
+        if m.alpha_mode != "opaque":
+            out["alphaMode"] = m.alpha_mode.upper()
+            if m.alpha_mode == "mask":
+                out["alphaCutoff"] = m.alpha_cutoff
+        return out
+
+    def _texture(self, texture: Texture) -> int:
+        if id(texture) not in self._textures:
+            sampler = {
+                "magFilter": 9729,
+                "minFilter": 9987,
+                "wrapS": _WRAPS[texture.wrap[0]],
+                "wrapT": _WRAPS[texture.wrap[1]],
+            }
+            if sampler not in self._samplers:
+                self._samplers.append(sampler)
+            self._textures[id(texture)] = len(self._pending)
+            entry = {"source": len(self._pending), "sampler": self._samplers.index(sampler)}
+            self.json.setdefault("textures", []).append(entry)
+            self._pending.append(texture)
+        return self._textures[id(texture)]
+
+
+def _unit(v: NDArray) -> NDArray[np.float32]:
+    """Unit length to float32 precision, which the validator asks for."""
+    w = np.asarray(v, np.float64)
+    return (w / np.maximum(np.linalg.norm(w, axis=1, keepdims=True), 1e-30)).astype(np.float32)
+
+
+def _png(texture: Texture) -> bytes:
+    """PNG with the encoding that glTF expects of the slot: float pixels become 8 bits."""
+    pixels = texture.pixels
+    if pixels.dtype not in (np.uint8, np.uint16):
+        value = np.clip(pixels.astype(np.float32), 0, 1)
+        if texture.color_space == "srgb":
+            value[..., :3] = linear_to_srgb(value[..., :3])
+        pixels = (value * 255 + 0.5).astype(np.uint8)
+    return images.encode_png(pixels)

@@ -1,0 +1,107 @@
+"""Image files to pixels and back, through OpenImageIO, without any colour conversion."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from appearance_opt.errors import InputError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+MAX_SIZE = 16384
+"""Widest and highest texture read (pixels)."""
+
+
+def decode(data: bytes, name: str) -> NDArray:
+    """Pixels (H, W, C) of an image file in memory; uint8, uint16 or float32 as stored, row 0 on top.
+    Raises InputError when it cannot be read."""
+    if not data:
+        raise InputError(f"{name}: the image is empty")
+    # the Python bindings of OpenImageIO read from and write to named files only
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / ("image" + _suffix(data, name))
+        path.write_bytes(data)
+        return _open(path, name)
+
+
+def read(path: Path) -> NDArray:
+    """Pixels of an image file. Raises InputError naming the file."""
+    if not Path(path).is_file():
+        raise InputError(f"{path}: no such image file")
+    return _open(Path(path), str(path))
+
+
+def _open(path: Path, name: str) -> NDArray:
+    import OpenImageIO as oiio
+
+    config = oiio.ImageSpec()
+    config.attribute("oiio:UnassociatedAlpha", 1)
+    source = oiio.ImageInput.open(str(path), config)
+    if source is None:
+        raise InputError(f"{name}: not a readable image ({_one_line(oiio.geterror()) or 'unknown format'})")
+    try:
+        return _read(source, name)
+    finally:
+        source.close()
+
+
+def _read(source, name: str) -> NDArray:  # noqa: ANN001 - an OpenImageIO.ImageInput
+    import OpenImageIO as oiio
+
+    spec = source.spec()
+    if spec.width > MAX_SIZE or spec.height > MAX_SIZE:
+        raise InputError(f"{name}: {spec.width} x {spec.height} pixels; at most {MAX_SIZE} x {MAX_SIZE} are supported")
+    kind = {oiio.UINT8: oiio.UINT8, oiio.UINT16: oiio.UINT16}.get(spec.format.basetype, oiio.FLOAT)
+    channels = min(spec.nchannels, 4)
+    pixels = source.read_image(0, 0, 0, channels, kind)
+    if pixels is None:
+        raise InputError(f"{name}: the image is damaged ({_one_line(source.geterror()) or 'cannot be decoded'})")
+    pixels = pixels.reshape(spec.height, spec.width, channels)
+    if pixels.dtype == np.float32 and not np.isfinite(pixels).all():
+        raise InputError(f"{name}: the image has NaN or infinite pixels")
+    return pixels
+
+
+def encode_png(pixels: NDArray) -> bytes:
+    """PNG file of (H, W, C) uint8 or uint16 pixels. Fast compression: a texture is written more often
+    than it is shipped."""
+    import OpenImageIO as oiio
+
+    height, width, channels = pixels.shape
+    spec = oiio.ImageSpec(width, height, channels, oiio.UINT16 if pixels.dtype == np.uint16 else oiio.UINT8)
+    spec.attribute("png:compressionLevel", 3)
+    spec.attribute("oiio:UnassociatedAlpha", 1)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "image.png"
+        out = oiio.ImageOutput.create(str(path))
+        if out is None or not out.open(str(path), spec) or not out.write_image(np.ascontiguousarray(pixels)):
+            raise OSError(f"cannot encode a PNG image: {oiio.geterror()}")
+        out.close()
+        return path.read_bytes()
+
+
+def _suffix(data: bytes, name: str) -> str:
+    """File suffix by magic number (OpenImageIO picks its reader by name first)."""
+    magic = (
+        (b"\x89PNG", ".png"),
+        (b"\xff\xd8", ".jpg"),
+        (b"\x76\x2f\x31\x01", ".exr"),
+        (b"II*\x00", ".tif"),
+        (b"MM\x00*", ".tif"),
+        (b"RIFF", ".webp"),
+        (b"BM", ".bmp"),
+        (b"#?", ".hdr"),
+    )
+    for head, suffix in magic:
+        if data.startswith(head):
+            return suffix
+    raise InputError(f"{name}: not a readable image (neither PNG, JPEG, EXR, TIFF, WebP, BMP nor HDR)")
+
+
+def _one_line(text: str) -> str:
+    return " ".join(text.split())

@@ -1,0 +1,43 @@
+"""Single-channel maps packed the way glTF does: G roughness, B metalness."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from appearance_opt.asset.types import Texture
+
+
+def resized(pixels: NDArray[np.float32], height: int, width: int) -> NDArray[np.float32]:
+    """Bilinear enlargement of (H, W, C) pixels, texel centres at (i + 0.5) / size."""
+    if pixels.shape[:2] == (height, width):
+        return pixels
+    for axis, size in ((0, height), (1, width)):
+        old = pixels.shape[axis]
+        at = np.clip((np.arange(size) + 0.5) * old / size - 0.5, 0, old - 1)
+        lower = np.floor(at).astype(np.intp)
+        upper = np.minimum(lower + 1, old - 1)
+        shape = [1, 1, 1]
+        shape[axis] = size
+        fraction = (at - lower).astype(np.float32).reshape(shape)
+        pixels = pixels.take(lower, axis) * (1 - fraction) + pixels.take(upper, axis) * fraction
+    return pixels
+
+
+def pack_orm(roughness: Texture | None, metalness: Texture | None) -> Texture:
+    """One (H, W, 3) texture from the first channels of two, either of which may be missing (1 then, so
+    that the material's factor decides). The smaller is brought to the size of the larger; 8-bit maps
+    of one size stay 8 bit."""
+    given = [t for t in (roughness, metalness) if t is not None]
+    height = max(t.pixels.shape[0] for t in given)
+    width = max(t.pixels.shape[1] for t in given)
+    if all(t.pixels.dtype == np.uint8 and t.pixels.shape[:2] == (height, width) for t in given):
+        out = np.full((height, width, 3), 255, np.uint8)
+        planes = [None if t is None else t.pixels[..., 0] for t in (roughness, metalness)]
+    else:
+        out = np.ones((height, width, 3), np.float32)
+        planes = [None if t is None else resized(t.linear(), height, width)[..., 0] for t in (roughness, metalness)]
+    for channel, plane in zip((1, 2), planes, strict=True):
+        if plane is not None:
+            out[..., channel] = plane
+    return Texture(out, "linear", given[0].wrap)

@@ -1,0 +1,62 @@
+"""Files that an asset refers to, and atomic writing."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+from urllib.parse import unquote, urlparse
+
+from appearance_opt.errors import InputError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+
+def resolve(reference: str, owner: Path, percent_encoded: bool = False) -> Path:
+    """Path of a file that ``owner`` refers to. Raises InputError when it lies outside owner's folder (an
+    asset must not read what it does not own) or does not exist."""
+    text = unquote(reference) if percent_encoded else reference
+    if "\0" in text or (urlparse(text).scheme and len(urlparse(text).scheme) > 1):
+        raise InputError(f"{owner}: refers to '{reference}', which is not a file beside it")
+    root = owner.resolve().parent
+    path = (root / text.replace("\\", "/")).resolve()
+    if not path.is_relative_to(root):
+        raise InputError(f"{owner}: refers to '{reference}' outside its own folder; copy the file beside it")
+    if not path.is_file():
+        raise InputError(f"{owner}: refers to '{reference}', which does not exist")
+    return path
+
+
+def read_bytes(path: Path) -> bytes:
+    """Content of a file. Raises InputError when it cannot be read or is empty."""
+    try:
+        data = Path(path).read_bytes()
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
+    if not data:
+        raise InputError(f"{path}: the file is empty")
+    return data
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """A temporary name in the folder of ``path`` (same suffix), renamed to it when all went well and
+    removed when not."""
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.stem}-", suffix=path.suffix)
+    os.close(handle)
+    temporary = Path(name)
+    try:
+        yield temporary
+        mask = os.umask(0)
+        os.umask(mask)
+        temporary.chmod(0o666 & ~mask)
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)

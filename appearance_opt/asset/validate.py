@@ -1,0 +1,153 @@
+"""What is wrong with an asset: counted, repaired where harmless, refused where not."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from appearance_opt.asset.normals import unit, vertex_normals, weld
+from appearance_opt.asset.types import Asset, Mesh
+from appearance_opt.errors import InputError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+
+@dataclass(frozen=True)
+class Validation:
+    """Counts over all meshes of an asset. Edges and parts are counted on welded positions."""
+
+    triangles: int = 0
+    non_finite_positions: int = 0
+    indices_out_of_range: int = 0
+    degenerate_faces: int = 0
+    duplicate_faces: int = 0
+    unreferenced_vertices: int = 0
+    meshes_without_uvs: int = 0
+    boundary_edges: int = 0
+    non_manifold_edges: int = 0
+    connected_parts: int = 0
+
+    def __add__(self, other: Validation) -> Validation:
+        return Validation(**{f.name: getattr(self, f.name) + getattr(other, f.name) for f in fields(self)})
+
+    def lines(self) -> list[str]:
+        """One line per count that is not zero."""
+        return [f"{f.name.replace('_', ' ')}: {getattr(self, f.name)}" for f in fields(self) if getattr(self, f.name)]
+
+
+def validate(asset: Asset) -> Validation:
+    """Count what is wrong. Changes nothing."""
+    total = Validation()
+    for mesh in asset.meshes:
+        total += _validate(mesh)
+    return total
+
+
+def _validate(mesh: Mesh) -> Validation:
+    bad_index = (mesh.faces < 0) | (mesh.faces >= len(mesh.positions))
+    finite = np.isfinite(mesh.positions).all(axis=1)
+    faces = mesh.faces[~bad_index.any(axis=1)]
+    basic = Validation(
+        triangles=len(mesh.faces),
+        non_finite_positions=int((~finite).sum()),
+        indices_out_of_range=int(bad_index.sum()),
+        degenerate_faces=int(_degenerate(mesh.positions, faces).sum()),
+        unreferenced_vertices=len(mesh.positions) - len(np.unique(faces)),
+        meshes_without_uvs=int(mesh.uvs is None),
+    )
+    if not len(faces):
+        return basic
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    first, place = weld(mesh.positions)
+    welded = place[faces]
+    edges = np.sort(np.concatenate([welded[:, [0, 1]], welded[:, [1, 2]], welded[:, [2, 0]]]), axis=1)
+    edges, uses = np.unique(edges[edges[:, 0] != edges[:, 1]], axis=0, return_counts=True)
+    n = len(first)
+    graph = coo_matrix((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), (n, n))
+    labels = connected_components(graph, directed=False)[1]
+    return basic + Validation(
+        duplicate_faces=len(welded) - len(np.unique(np.sort(welded, axis=1), axis=0)),
+        boundary_edges=int((uses == 1).sum()),
+        non_manifold_edges=int((uses > 2).sum()),
+        connected_parts=len(np.unique(labels[np.unique(welded)])),
+    )
+
+
+def repair(asset: Asset, source: str) -> Asset:
+    """The asset with harmless faults mended, and a note for each kind. ``source`` names it in errors.
+
+    Dropped: degenerate faces, unreferenced vertices, empty meshes. Recomputed: normals that are not
+    finite or zero. Raises InputError for positions or texture coordinates that are not finite, indices
+    out of range, and when no face is left.
+    """
+    notes: list[str] = []
+    meshes = [m for m in (_repair(mesh, source, notes) for mesh in asset.meshes) if len(m.faces)]
+    if not meshes:
+        raise InputError(f"{source}: there are no triangles in it")
+    return replace(asset, meshes=tuple(meshes), notes=asset.notes + tuple(notes))
+
+
+def _repair(mesh: Mesh, source: str, notes: list[str]) -> Mesh:
+    bad = int(((mesh.faces < 0) | (mesh.faces >= len(mesh.positions))).any(axis=1).sum())
+    if bad:
+        raise InputError(
+            f"{source}, mesh '{mesh.name}': {bad} faces refer to vertices that do not exist "
+            f"(there are {len(mesh.positions)}); export it again"
+        )
+    used = np.unique(mesh.faces)
+    broken = int((~np.isfinite(mesh.positions[used])).any(axis=1).sum())
+    if broken:
+        raise InputError(f"{source}, mesh '{mesh.name}': {broken} positions are NaN or infinite; export it again")
+    for name in ("uvs", "colors"):
+        values = getattr(mesh, name)
+        if values is not None and not np.isfinite(values[used]).all():
+            raise InputError(f"{source}, mesh '{mesh.name}': its {name} have NaN or infinite values; export it again")
+    degenerate = _degenerate(mesh.positions, mesh.faces)
+    if degenerate.any():
+        notes.append(f"mesh '{mesh.name}': {int(degenerate.sum())} degenerate faces dropped")
+        mesh = replace(mesh, faces=mesh.faces[~degenerate])
+        used = np.unique(mesh.faces)
+    if len(used) < len(mesh.positions):
+        notes.append(f"mesh '{mesh.name}': {len(mesh.positions) - len(used)} unreferenced vertices dropped")
+        mesh = _compacted(mesh, used)
+    return _repair_normals(mesh, notes)
+
+
+def _repair_normals(mesh: Mesh, notes: list[str]) -> Mesh:
+    if mesh.normals is None:
+        return replace(mesh, tangents=None)
+    length = np.linalg.norm(mesh.normals, axis=1)
+    bad = ~np.isfinite(length) | (length < 1e-6)
+    if bad.any():
+        notes.append(f"mesh '{mesh.name}': {int(bad.sum())} normals recomputed")
+        normals = np.where(bad[:, None], vertex_normals(mesh.positions, mesh.faces), mesh.normals)
+        mesh = replace(mesh, normals=normals.astype(np.float32))
+    if mesh.normals is not None and np.abs(length[~bad] - 1).max(initial=0) > 1e-3:
+        mesh = replace(mesh, normals=unit(mesh.normals))
+    if mesh.tangents is not None:
+        size = np.linalg.norm(mesh.tangents[:, :3], axis=1)
+        if not np.isfinite(size).all() or (size < 1e-6).any():
+            notes.append(f"mesh '{mesh.name}': unusable tangents recomputed")
+            mesh = replace(mesh, tangents=None)
+    return mesh
+
+
+def _compacted(mesh: Mesh, used: NDArray) -> Mesh:
+    new = np.full(len(mesh.positions), -1, np.int32)
+    new[used] = np.arange(len(used), dtype=np.int32)
+    attributes = ("positions", "normals", "uvs", "tangents", "colors")
+    kept = {a: getattr(mesh, a)[used] for a in attributes if getattr(mesh, a) is not None}
+    return replace(mesh, faces=new[mesh.faces], **kept)
+
+
+def _degenerate(positions: NDArray, faces: NDArray) -> NDArray[np.bool_]:
+    """Faces with two corners at the same place, or without area in double precision."""
+    p = np.asarray(positions, np.float64)
+    with np.errstate(invalid="ignore", over="ignore"):
+        cross = np.cross(p[faces[:, 1]] - p[faces[:, 0]], p[faces[:, 2]] - p[faces[:, 0]])
+        return ~(np.abs(cross).max(axis=1, initial=0) > 0) & np.isfinite(cross).all(axis=1)

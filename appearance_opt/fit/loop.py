@@ -1,0 +1,229 @@
+"""The loop: draw views, step, look at held-out views now and then, keep the best state."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Literal, Protocol
+
+import numpy as np
+
+from appearance_opt.errors import DivergedError
+from appearance_opt.fit import adam
+from appearance_opt.fit.checkpoint import Checkpointer, FitState
+from appearance_opt.fit.laplacian import Laplacian
+from appearance_opt.fit.losses import loss_of_name
+from appearance_opt.fit.model import POSITIONS, Model
+from appearance_opt.fit.schedule import Clock, laplacian_weight, learning_rate
+from appearance_opt.fit.step import StepInputs, first_non_finite, step
+from appearance_opt.fit.validation import Validation
+from appearance_opt.render.deferred import Grid
+from appearance_opt.render.gradient import Quality
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from appearance_opt.reference.pool import ReferencePool
+
+log = logging.getLogger(__name__)
+
+MAX_BAD_STEPS = 10
+"""Consecutive steps with non-finite gradients after which a fit gives up."""
+
+Background = Literal["random", "black", "white", "grey"] | tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class FitOptions:
+    """How to fit. ``steps``/``seconds``: when to stop (at least one). ``laplacian``: weight relative to
+    the first image loss, at a deviation of a tenth of an edge length (0: none). ``relative``: hold the
+    Laplacian of the start rather than 0. ``decay``: powers of ten by which the rates fall over the fit.
+    ``validate_every``: fraction of the fit between looks at the held-out views."""
+
+    steps: int | None = None
+    seconds: float | None = None
+    loss: str = "log-srgb-l1"
+    laplacian: float = 0.25
+    relative: bool = True
+    decay: float = 1.5
+    background: Background = "random"
+    quality: Quality = Quality()
+    validate_every: float = 0.1
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class CurvePoint:
+    """A look at the held-out views: seconds of fitting, iteration, PSNR in dB, latest loss."""
+
+    seconds: float
+    step: int
+    psnr: float
+    loss: float
+
+
+@dataclass
+class FitResult:
+    """What a fit did. The model is left at its best state by held-out PSNR, the start included."""
+
+    curve: list[CurvePoint] = field(default_factory=list)
+    steps: int = 0
+    skipped: int = 0
+    seconds: float = 0.0
+    interrupted: bool = False
+    best_step: int = 0
+
+
+class Progress(Protocol):
+    """Called after every step and every look at the held-out views."""
+
+    def update(
+        self, step: int, fraction: float, loss: float, psnr: float, steps_per_second: float, seconds_left: float | None
+    ) -> None: ...
+
+
+def fit(
+    model: Model,
+    pool: ReferencePool,
+    validation: Validation,
+    options: FitOptions,
+    progress: Progress | None = None,
+    checkpointer: Checkpointer | None = None,
+) -> FitResult:
+    """Fit the model to the pool's reference. Raises DivergedError (the model then holds the best
+    state)."""
+    run = _Run(model, pool, validation, options, progress, checkpointer)
+    try:
+        run.look()
+        while not run.clock.done(run.state.iteration):
+            run.advance()
+    except KeyboardInterrupt:
+        log.warning("interrupted at step %d: the best state so far is kept", run.state.iteration)
+        run.result.interrupted = True
+    except DivergedError:
+        run.finish(look=False)
+        raise
+    run.finish(look=not run.result.interrupted)
+    return run.result
+
+
+class _Run:
+    """The only mutable state of a fit."""
+
+    def __init__(
+        self,
+        model: Model,
+        pool: ReferencePool,
+        validation: Validation,
+        options: FitOptions,
+        progress: Progress | None,
+        checkpointer: Checkpointer | None,
+    ) -> None:
+        self.model, self.pool, self.validation, self.options = model, pool, validation, options
+        self.progress, self.checkpointer = progress, checkpointer
+        self.loss = loss_of_name(options.loss)
+        self.grid = Grid(pool.batch, pool.resolution)
+        self.result = FitResult()
+        self.state = FitState(moments={n: adam.moments_of(p) for n, p in model.parameters.items()})
+        self.laplacian: Laplacian | None = None
+        if POSITIONS in model.parameters and options.laplacian > 0:
+            mesh = model.topology.mesh
+            self.laplacian = Laplacian(mesh.positions, mesh.faces, model.edge_length, options.relative)
+        if checkpointer is not None and checkpointer.restore(model, self.state):
+            self.result.curve = [CurvePoint(*p) for p in self.state.curve]
+        self.clock = Clock(options.steps, options.seconds, self.state.seconds)
+        self.bad_steps = 0
+        self.psnr = self.state.best_psnr
+        self.next_look = self.clock.progress(self.state.iteration) + options.validate_every
+
+    def advance(self) -> None:
+        """One iteration."""
+        state, options = self.state, self.options
+        fraction = self.clock.progress(state.iteration)
+        views, reference = self.pool.draw(state.iteration)
+        inputs = StepInputs(
+            views=views,
+            reference=reference,
+            background=backgrounds(options.background, len(views), options.seed, state.iteration),
+            laplacian_weight=laplacian_weight(state.laplacian, fraction),
+            rate=learning_rate(fraction, options.decay),
+            seed=state.iteration,
+        )
+        done = step(
+            self.model, state.moments, self.grid, options.quality, self.loss, self.laplacian, inputs, first_non_finite
+        )
+        self._count(done.bad)
+        if done.bad is None:
+            state.loss = done.loss
+            if state.laplacian == 0 and self.laplacian is not None:
+                # a deviation of a tenth of an edge length costs this fraction of the first image loss
+                state.laplacian = options.laplacian * done.loss / 0.01
+        state.iteration += 1
+        if self.clock.progress(state.iteration) >= self.next_look and not self.clock.done(state.iteration):
+            self.look()
+            self.next_look += options.validate_every
+        self._report()
+        if self.checkpointer is not None and self.checkpointer.due():
+            self.save()
+
+    def look(self) -> None:
+        """Render the held-out views; remember the state if it is the best so far."""
+        self.psnr = self.validation.psnr(self.model)
+        state = self.state
+        point = CurvePoint(self.clock.time(), state.iteration, self.psnr, state.loss)
+        if not self.result.curve or self.result.curve[-1].step != state.iteration:
+            self.result.curve.append(point)
+        if state.best is None or self.psnr > state.best_psnr:
+            state.best, state.best_psnr, state.best_iteration = self.model.values(), self.psnr, state.iteration
+
+    def finish(self, look: bool) -> None:
+        """A last look, then back to the best state."""
+        if look:
+            self.look()
+        if self.checkpointer is not None:
+            self.save()
+        if self.state.best is not None:
+            self.model.restore(self.state.best)
+        self.result.steps = self.state.iteration
+        self.result.best_step = self.state.best_iteration
+        self.result.skipped = self.state.skipped
+        self.result.seconds = self.clock.time()
+
+    def save(self) -> None:
+        """Write a checkpoint."""
+        self.state.seconds = self.clock.time()
+        self.state.curve = [(p.seconds, p.step, p.psnr, p.loss) for p in self.result.curve]
+        if self.checkpointer is not None:
+            self.checkpointer.save(self.model, self.state)
+
+    def _count(self, bad: str | None) -> None:
+        if bad is None:
+            self.bad_steps = 0
+            return
+        self.state.skipped += 1
+        self.bad_steps += 1
+        log.warning("step %d skipped: the gradient of '%s' is not finite", self.state.iteration, bad)
+        if self.bad_steps >= MAX_BAD_STEPS:
+            raise DivergedError(
+                f"the gradient of '{bad}' was not finite for {self.bad_steps} steps up to iteration "
+                f"{self.state.iteration}: lower its learning rate, or check the reference's images"
+            )
+
+    def _report(self) -> None:
+        if self.progress is None:
+            return
+        state = self.state
+        seconds = self.clock.time()
+        fraction = self.clock.progress(state.iteration)
+        left = seconds * (1 - fraction) / fraction if fraction > 0 else None
+        self.progress.update(state.iteration, fraction, state.loss, self.psnr, state.iteration / max(seconds, 1e-9), left)
+
+
+def backgrounds(background: Background, count: int, seed: int, iteration: int) -> NDArray[np.float32]:
+    """(count, 3) linear colours behind the views of an iteration. Random ones make every silhouette
+    visible, whatever the colour of the object."""
+    if background == "random":
+        return np.random.default_rng([seed, 7, iteration]).random((count, 3)).astype(np.float32)
+    fixed = {"black": (0.0,) * 3, "white": (1.0,) * 3, "grey": (0.18,) * 3}
+    color = fixed[background] if isinstance(background, str) else background
+    return np.tile(np.asarray(color, np.float32), (count, 1))
