@@ -61,21 +61,26 @@ class Views:
 
 
 def look_at(
-    eye: NDArray, target: NDArray, fov: float, light: NDArray, intensity: NDArray, up: NDArray | None = None
+    eye: NDArray,
+    target: NDArray,
+    fov: float | NDArray,
+    light: NDArray,
+    intensity: NDArray | float,
+    up: NDArray | None = None,
 ) -> Views:
     """Cameras at ``eye`` (B, 3) that look at ``target`` (B, 3) or (3,), with a field of view of ``fov``
-    degrees (full angle, width = height), lights at ``light`` (B, 3)."""
+    degrees (full angle, width = height; one number or (B,)), lights at ``light`` (B, 3)."""
     eye = np.atleast_2d(np.asarray(eye, np.float64))
     forward = np.asarray(target, np.float64) - eye
     forward /= np.linalg.norm(forward, axis=1, keepdims=True)
     up = np.broadcast_to([0.0, 1.0, 0.0] if up is None else up, eye.shape)
     # a camera that looks along `up` takes the next axis instead
-    vertical = np.abs(np.sum(forward * up, 1)) > 0.999
+    vertical = np.abs(np.sum(forward * up, 1)) > 0.999 * np.linalg.norm(up, axis=1)
     up = np.where(vertical[:, None], np.roll(up, 1, axis=1), up)
     right = np.cross(forward, up)
     right /= np.linalg.norm(right, axis=1, keepdims=True)
     down = np.cross(forward, right)
-    scale = np.tan(np.radians(fov) / 2)
+    scale = np.tan(np.radians(np.broadcast_to(fov, len(eye))) / 2)[:, None]
     arrays = (eye, forward, right * scale, down * scale, light, np.broadcast_to(intensity, len(eye)))
     return Views(*(np.ascontiguousarray(a, np.float32) for a in arrays))
 
@@ -84,11 +89,11 @@ def look_at(
 class ViewSampler:
     """Random cameras on a sphere around the object, each with one random point light.
 
-    Cameras look at the centre, roll is random, and the bounding sphere fills the image (or, with
-    ``zoom`` > 1, up to that many times less of it is seen, at a random place). The light's direction is
-    uniform within a cone around the direction to the camera (``light_spread`` degrees, 180 = anywhere),
-    or it sits at the camera (``headlight``). Its intensity makes a white diffuse surface at the centre
-    that faces it reflect ``exposure``.
+    Roll is random. Each view is framed by itself: the extreme points ``hull`` (N, 3) of the object, or its
+    bounding sphere when they are not known, just fill the image. The light's direction is uniform within
+    a cone around the direction to the camera (``light_spread`` degrees, 180 = anywhere), or it sits at
+    the camera (``headlight``). Its intensity makes a white diffuse surface at the centre that faces it
+    reflect ``exposure``.
 
     Views are a pure function of (seed, stream, iteration): any iteration can be replayed, and a
     resumed fit goes on with the same sequence.
@@ -99,14 +104,14 @@ class ViewSampler:
     seed: int = 0
     stream: int = 0
     fov: float = 32.0
-    zoom: float = 1.0
+    hull: NDArray | None = None
     light: LightMode = "point"
     light_spread: float = 75.0
     exposure: float = 0.85
 
     def held_out(self, stream: int) -> ViewSampler:
-        """The same distribution, other draws, unzoomed: views that the fit never saw."""
-        return replace(self, stream=stream, zoom=1.0)
+        """The same distribution, other draws: views that the fit never saw."""
+        return replace(self, stream=stream)
 
     def draw(self, iteration: int, count: int) -> Views:
         """``count`` views of this iteration."""
@@ -114,22 +119,37 @@ class ViewSampler:
         direction = _unit(rng.normal(size=(count, 3)))
         spin = _unit(rng.normal(size=(count, 3)))
         centre = np.asarray(self.centre, np.float64)
-        # far enough that the bounding sphere, with 2 % to spare, fits into the image
-        distance = 1.02 * self.radius / np.sin(np.radians(self.fov) / 2)
-        target = np.broadcast_to(centre, (count, 3))
-        fov = self.fov
-        if self.zoom > 1.0:
-            offset = _unit(rng.normal(size=(count, 3))) * rng.uniform(size=(count, 1)) ** (1 / 3)
-            target = centre + offset * self.radius * (1 - 1 / self.zoom)
-            fov = float(2 * np.degrees(np.arctan(np.tan(np.radians(self.fov) / 2) / self.zoom)))
+        distance = MARGIN * self.radius / np.sin(np.radians(self.fov) / 2)
         toward_light = direction
         if self.light == "point":
             cosine = rng.uniform(np.cos(np.radians(self.light_spread)), 1.0, size=(count, 1))
             side = _unit(np.cross(direction, _unit(rng.normal(size=(count, 3)))))
             toward_light = direction * cosine + side * np.sqrt(np.maximum(0.0, 1 - cosine**2))
         lamp = distance if self.light == "headlight" else 4 * self.radius
-        intensity = np.full(count, np.pi * self.exposure * lamp**2)
-        return look_at(centre + direction * distance, target, fov, centre + toward_light * lamp, intensity, spin)
+        intensity = np.pi * self.exposure * lamp**2
+        views = look_at(centre + direction * distance, centre, self.fov, centre + toward_light * lamp, intensity, spin)
+        return views if self.hull is None else _framed(views, self.hull)
+
+
+MARGIN = 1.02
+"""Framing leaves this much room around the object."""
+
+
+def _framed(views: Views, points: NDArray) -> Views:
+    """The same eyes and lights, turned and zoomed so that ``points`` (N, 3) just fill each image."""
+    scale = np.linalg.norm(views.right, axis=1, keepdims=True)
+    v = points[None] - views.eye[:, None]
+    depth = np.einsum("bnk,bk->bn", v, views.forward)
+    x = np.einsum("bnk,bk->bn", v, views.right / scale) / depth
+    y = np.einsum("bnk,bk->bn", v, views.down / scale) / depth
+    middle_x, middle_y = ((a.min(axis=1) + a.max(axis=1)) / 2 for a in (x, y))
+    target = views.eye + views.forward + (views.right * middle_x[:, None] + views.down * middle_y[:, None]) / scale
+    turned = look_at(views.eye, target, 90.0, views.light, views.intensity, -views.down)
+    depth = np.einsum("bnk,bk->bn", v, turned.forward)
+    reach = [np.abs(np.einsum("bnk,bk->bn", v, a) / depth).max(axis=1) for a in (turned.right, turned.down)]
+    half = MARGIN * np.maximum(*reach)[:, None]
+    arrays = (turned.right * half, turned.down * half)
+    return replace(turned, right=arrays[0].astype(np.float32), down=arrays[1].astype(np.float32))
 
 
 def framing(points: NDArray) -> tuple[tuple[float, float, float], float]:

@@ -76,6 +76,7 @@ class Model:
                 codec.per_channel({n: BOUNDS[n][0] for n in fitted}),
                 codec.per_channel({n: BOUNDS[n][1] for n in fitted}),
             )
+        self._initial_texels = np.array(self.parameters[TEXELS].value) if fitted else np.empty(0, np.float32)
         self._fixed_layers: tuple[TexelLayer, ...] = ()
         self._fixed_maps = {n: v.astype(np.float32) for n, v in images.items() if n not in fitted}
         if self._fixed_maps:
@@ -116,6 +117,15 @@ class Model:
         if self.codec is not None:
             out.update(self.codec.to_maps(self.parameters[TEXELS].value))
         return out
+
+    def touched(self, inside: NDArray[np.bool_], known: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """(size, size) texels whose values mean something: inside a chart, and either known at the start
+        or changed by the fit since."""
+        if self.codec is None or known.any():
+            return inside & known if known.any() else inside
+        texels = np.array(self.parameters[TEXELS].value).reshape(inside.shape[0], inside.shape[1], -1)
+        changed = (texels != self._initial_texels.reshape(texels.shape)).any(axis=-1)
+        return inside & changed
 
     def values(self) -> dict[str, mi.Float]:
         """Snapshot of all parameters (arrays are never changed in place, so this copies nothing)."""

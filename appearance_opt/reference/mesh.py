@@ -14,7 +14,8 @@ from appearance_opt.asset.tangents import any_tangent, split_and_tangents
 from appearance_opt.reference.textures import material_maps
 from appearance_opt.render import deferred, upload
 from appearance_opt.render.deferred import Grid
-from appearance_opt.render.surface import Surface
+from appearance_opt.render.material import evaluate, shading_normal
+from appearance_opt.render.surface import Surface, interpolate_at
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -83,6 +84,26 @@ class MeshReference:
         """The same for a batch whose records are on the device; the image stays there, flat."""
         with dr.suspend_grad():
             return deferred.render_image(self.scene, self.surface, self.maps, records, grid, samples)
+
+
+    def sample(self, triangle: mi.UInt32, b1: mi.Float, b2: mi.Float, area: mi.Float) -> SurfaceSample:
+        """Appearance at barycentric points of triangles, averaged over a patch of ``area`` (world units
+        squared). Used by the closed-form transfer."""
+        with dr.suspend_grad():
+            hit = interpolate_at(self.surface, triangle, b1, b2, area)
+            sample = evaluate(self.maps, hit)
+            return SurfaceSample(sample.base_color, sample.roughness, sample.metalness, shading_normal(hit, sample))
+
+
+@dataclass
+class SurfaceSample:
+    """Appearance of a reference at points of its surface: linear base colour, roughness, metalness, unit
+    shading normal in world space."""
+
+    base_color: mi.Color3f
+    roughness: mi.Float
+    metalness: mi.Float
+    normal: mi.Vector3f
 
 
 def merge(asset: Asset, material_of: list[int], need_tangents: bool) -> MergedMesh:

@@ -60,9 +60,7 @@ def interpolate(surface: Surface, camera: Camera, samples: Samples, resolution: 
     width of a sample in pixels. The normal is turned towards the viewer when the back of the triangle
     is seen.
     """
-    count = dr.width(samples.triangle)
-    face = dr.gather(mi.ArrayXu, surface.faces, samples.triangle, shape=(4, count))
-    rows = [_packet(surface.vertices, face[k], 8) for k in range(3)]
+    face, rows = _triangle(surface, samples.triangle)
     p = [mi.Point3f(r[0], r[1], r[2]) for r in rows]
     e1, e2 = p[1] - p[0], p[2] - p[0]
     d = direction(camera, samples.x, samples.y, resolution)
@@ -74,49 +72,86 @@ def interpolate(surface: Surface, camera: Camera, samples: Samples, resolution: 
     r = dr.cross(o, e1)
     b2 = dr.dot(d, r) * inverse
     depth = dr.dot(e2, r) * inverse
+
+    facing = dr.detach(dr.cross(e1, e2))
+    length = dr.norm(d)
+    cosine = dr.dot(facing, d) / (length * at_least(dr.norm(facing), 1e-30))
+    hit = Hit(dr.fma(d, depth, camera.eye), mi.Vector3f(0), d / -length, face[3])
+    pixel = dr.detach(depth) * (2 * width / resolution) * dr.norm(camera.right)
+    area = dr.square(pixel) / at_least(dr.abs(cosine), GRAZING_COSINE)
+    _attributes(hit, surface, samples.triangle, face, rows, b1, b2, dr.norm(facing), area)
+    # the back of a triangle is seen: turning the normal over also turns the bitangent, which the sign of
+    # the handedness undoes
+    back = cosine > 0
+    hit.normal = dr.select(back, -hit.normal, hit.normal)
+    if hit.handedness is not None:
+        hit.handedness = dr.select(back, -hit.handedness, hit.handedness)
+    return hit
+
+
+def interpolate_at(surface: Surface, triangle: mi.UInt32, b1: mi.Float, b2: mi.Float, area: mi.Float) -> Hit:
+    """Attributes at barycentric points of triangles, seen from outside; ``area`` of the patch that a
+    point stands for, in world units squared. ``to_viewer`` is zero."""
+    face, rows = _triangle(surface, triangle)
+    p = [mi.Point3f(r[0], r[1], r[2]) for r in rows]
+    twice_area = dr.norm(dr.cross(p[1] - p[0], p[2] - p[0]))
+    position = p[0] * (1 - b1 - b2) + p[1] * b1 + p[2] * b2
+    hit = Hit(position, mi.Vector3f(0), mi.Vector3f(0), face[3])
+    _attributes(hit, surface, triangle, face, rows, b1, b2, twice_area, area)
+    return hit
+
+
+def face_normal(surface: Surface, triangle: mi.UInt32, active: mi.Bool) -> mi.Vector3f:
+    """Normal of triangles by their winding, not normalised; zero where inactive."""
+    face = dr.gather(mi.ArrayXu, surface.faces, triangle, active, shape=(4, dr.width(triangle)))
+    p = []
+    for k in range(3):
+        row = dr.gather(mi.ArrayXf, surface.vertices, face[k], active, shape=(8, dr.width(triangle)))
+        p.append(mi.Point3f(row[0], row[1], row[2]))
+    return dr.cross(p[1] - p[0], p[2] - p[0])
+
+
+def _triangle(surface: Surface, triangle: mi.UInt32) -> tuple[mi.ArrayXu, list]:
+    face = dr.gather(mi.ArrayXu, surface.faces, triangle, shape=(4, dr.width(triangle)))
+    return face, [_packet(surface.vertices, face[k], 8) for k in range(3)]
+
+
+def _attributes(
+    hit: Hit,
+    surface: Surface,
+    triangle: mi.UInt32,
+    face: mi.ArrayXu,
+    rows: list,
+    b1: mi.Float,
+    b2: mi.Float,
+    twice_area: mi.Float,
+    area: mi.Float,
+) -> None:
+    """Fill in the interpolated attributes of ``hit``: normal, and what the surface has of vertex colours,
+    texture coordinates and tangents. ``area`` of a sample on the surface becomes its UV footprint."""
     b0 = 1 - b1 - b2
 
     def mix(values: list) -> mi.Float:
         return dr.fma(values[0], b0, dr.fma(values[1], b1, values[2] * b2))
 
-    facing = dr.detach(dr.cross(e1, e2))
-    back = dr.dot(facing, d) > 0
-    normal = dr.normalize(mi.Vector3f(*(mix([v[c] for v in rows]) for c in (4, 5, 6))))
-    hit = Hit(
-        position=dr.fma(d, depth, camera.eye),
-        normal=dr.select(back, -normal, normal),
-        to_viewer=-dr.normalize(d),
-        material=face[3],
-    )
+    hit.normal = dr.normalize(mi.Vector3f(*(mix([v[c] for v in rows]) for c in (4, 5, 6))))
     if surface.colors is not None:
         c = [_packet(surface.colors, face[k], 4) for k in range(3)]
         hit.color = mi.Color3f(*(mix([v[k] for v in c]) for k in range(3)))
     if surface.frames is None:
-        return hit
-
-    pixel = 2 * width / resolution * dr.norm(camera.right)  # width of a sample at depth 1
+        return
     corner = face
     if surface.corners is not None:
-        corner = dr.gather(mi.ArrayXu, surface.corners, samples.triangle, shape=(4, count))
+        corner = dr.gather(mi.ArrayXu, surface.corners, triangle, shape=(4, dr.width(triangle)))
     f = [_packet(surface.frames, corner[k], 8 if surface.has_tangents else 2) for k in range(3)]
     hit.uv = mi.Point2f(mix([v[0] for v in f]), mix([v[1] for v in f]))
-    hit.footprint = _uv_footprint([mi.Point2f(v[0], v[1]) for v in f], facing, d, dr.detach(depth) * pixel)
+    a, b = (dr.detach(mi.Point2f(f[k][0] - f[0][0], f[k][1] - f[0][1])) for k in (1, 2))
+    uv_area = dr.abs(a.x * b.y - a.y * b.x)
+    hit.footprint = area * uv_area / at_least(dr.detach(twice_area), 1e-30)
     if surface.has_tangents:
         hit.tangent = dr.normalize(mi.Vector3f(*(mix([v[c] for v in f]) for c in (4, 5, 6))))
         hit.handedness = f[0][2]
-        # turning the normal over also turns the bitangent: undone here, so that the map's frame stays
-        hit.handedness = dr.select(back, -hit.handedness, hit.handedness)
-    return hit
 
 
 def _packet(buffer: mi.Float, index: mi.UInt32, channels: int) -> mi.ArrayXf:
     return dr.gather(mi.ArrayXf, buffer, index, mode=dr.ReduceMode.Expand, shape=(channels, dr.width(index)))
-
-
-def _uv_footprint(uv: list, facing: mi.Vector3f, d: mi.Vector3f, width: mi.Float) -> mi.Float:
-    """Area in UV space of a sample of the given world-space width across the ray."""
-    a, b = dr.detach(uv[1] - uv[0]), dr.detach(uv[2] - uv[0])
-    uv_area = dr.abs(a.x * b.y - a.y * b.x)
-    area = at_least(dr.norm(facing), 1e-30)
-    cosine = dr.abs(dr.dot(facing, d)) * dr.rsqrt(dr.squared_norm(d)) / area
-    return dr.square(width) / at_least(cosine, GRAZING_COSINE) * (uv_area / area)

@@ -1,0 +1,51 @@
+"""appearance-opt: a heavy 3D asset in, a light one that looks the same out."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from appearance_opt.asset import load, save
+    from appearance_opt.config import SimplifyOptions, simplify_options
+    from appearance_opt.errors import AppearanceError, BackendError, DivergedError, InputError, ReferenceRenderError
+    from appearance_opt.jobs.compare import compare
+    from appearance_opt.jobs.simplify import simplify
+
+__version__ = "0.1.0"
+
+_HOMES = {
+    "AppearanceError": "appearance_opt.errors",
+    "BackendError": "appearance_opt.errors",
+    "DivergedError": "appearance_opt.errors",
+    "InputError": "appearance_opt.errors",
+    "ReferenceRenderError": "appearance_opt.errors",
+    "SimplifyOptions": "appearance_opt.config",
+    "compare": "appearance_opt.jobs.compare",
+    "load": "appearance_opt.asset",
+    "save": "appearance_opt.asset",
+    "simplify": "appearance_opt.jobs.simplify",
+    "simplify_options": "appearance_opt.config",
+}
+
+__all__ = [
+    "AppearanceError",
+    "BackendError",
+    "DivergedError",
+    "InputError",
+    "ReferenceRenderError",
+    "SimplifyOptions",
+    "compare",
+    "load",
+    "save",
+    "simplify",
+    "simplify_options",
+]
+
+
+def __getattr__(name: str) -> Any:
+    # imported when first used: `import appearance_opt` and --help stay fast
+    if name not in _HOMES:
+        raise AttributeError(f"module 'appearance_opt' has no attribute '{name}'")
+    from importlib import import_module
+
+    return getattr(import_module(_HOMES[name]), name)

@@ -1,0 +1,195 @@
+"""Options of the jobs: checked when made, from presets, a TOML file or the command line."""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+from appearance_opt.errors import InputError
+
+FIT_PARTS = ("shape", "normal", "material", "gamma")
+INITS = ("decimate", "sphere")
+LOSS_NAMES = ("log-srgb-l1", "log-srgb-l2", "l1", "l2", "smape", "relative-l2")
+BACKGROUNDS = ("random", "black", "white", "grey")
+LIGHTS = ("point", "headlight")
+DEVICES = ("auto", "cpu", "cuda")
+
+PRESETS: dict[str, dict[str, Any]] = {
+    "draft": {"budget": 17.0, "resolution": 192, "pool": 96},
+    "default": {"budget": 65.0, "resolution": 256, "pool": 320},
+    "final": {"budget": 280.0, "resolution": 320, "pool": 640},
+}
+"""What each preset sets; everything else keeps its default. See docs/performance.md for how they were
+chosen."""
+
+
+@dataclass(frozen=True)
+class SimplifyOptions:
+    """How to simplify.
+
+    ``triangles`` or ``ratio``: the budget (exactly one). ``texture_size``: texels per side of the
+    new maps, a power of two. ``resolution``, ``views``: pixels per side and views of a step. ``steps``,
+    ``budget`` (seconds for the whole job, set-up and report included): when to stop; whichever comes first.
+    ``pool``: number of reference views rendered (each is used many times). ``fit``: what moves.
+    ``init``: "decimate", "sphere", or a file with a start. ``relative``: the Laplacian keeps the start's shape
+    (a sphere start uses the absolute one unless told otherwise). ``*_rate``: learning rates; positions in
+    units of the local edge length. ``keep_hidden``: keep geometry that no outside view sees.
+    ``subdivision``: level for USD subdivision surfaces. Raises InputError for values that make no sense.
+    """
+
+    triangles: int | None = None
+    ratio: float | None = None
+    texture_size: int = 1024
+    resolution: int = 256
+    views: int = 4
+    steps: int | None = None
+    budget: float | None = None
+    pool: int = 320
+    fit: tuple[str, ...] = ("shape", "normal", "material")
+    init: str = "decimate"
+    loss: str = "log-srgb-l1"
+    laplacian: float = 0.25
+    relative: bool | None = None
+    position_rate: float = 0.005
+    normal_rate: float = 0.005
+    color_rate: float = 0.004
+    material_rate: float = 0.004
+    background: str = "random"
+    light: str = "point"
+    seed: int = 0
+    keep_hidden: bool = False
+    subdivision: int = 1
+    device: str = "auto"
+
+    def __post_init__(self) -> None:
+        if (self.triangles is None) == (self.ratio is None):
+            raise InputError("give either --triangles N or --ratio R")
+        if self.triangles is not None:
+            _require(self.triangles >= 4, "triangles", self.triangles, "at least 4")
+        if self.ratio is not None:
+            _require(0 < self.ratio <= 1, "ratio", self.ratio, "above 0 and at most 1")
+        size = self.texture_size
+        _require(16 <= size <= 8192 and size & (size - 1) == 0, "texture-size", size, "a power of two from 16 to 8192")
+        _require(16 <= self.resolution <= 4096, "resolution", self.resolution, "from 16 to 4096")
+        _require(1 <= self.views <= 64, "views", self.views, "from 1 to 64")
+        _require(self.pool >= self.views, "pool", self.pool, "at least as many as --views")
+        _require(self.steps is None or self.steps >= 0, "steps", self.steps, "0 or more")
+        _require(self.budget is None or self.budget > 0, "budget", self.budget, "a positive time such as 60s")
+        _require(0 <= self.subdivision <= 5, "subdivision", self.subdivision, "from 0 to 5")
+        _require(self.laplacian >= 0, "laplacian", self.laplacian, "0 or more")
+        for name in ("position_rate", "normal_rate", "color_rate", "material_rate"):
+            _require(0 <= getattr(self, name) <= 1, name.replace("_", "-"), getattr(self, name), "from 0 to 1")
+        for part in self.fit:
+            _choice("fit", part, FIT_PARTS)
+        _choice("loss", self.loss, LOSS_NAMES)
+        _choice("light", self.light, LIGHTS)
+        _choice("device", self.device, DEVICES)
+        self.background_color()
+        if self.init not in INITS and not Path(self.init).suffix:
+            _choice("init", self.init, INITS)
+
+    def background_color(self) -> str | tuple[float, float, float]:
+        """A name, or linear RGB."""
+        if self.background in BACKGROUNDS:
+            return self.background
+        try:
+            r, g, b = (float(x) for x in self.background.split(","))
+        except ValueError:
+            raise InputError(
+                f"--background {self.background}: give one of {', '.join(BACKGROUNDS)} or three numbers r,g,b"
+            ) from None
+        return (r, g, b)
+
+
+def simplify_options(preset: str = "default", **values: Any) -> SimplifyOptions:
+    """Options from a preset and what overrides it. Raises InputError for unknown names and bad values."""
+    _choice("preset", preset, tuple(PRESETS))
+    known = {f.name for f in fields(SimplifyOptions)}
+    for name in values:
+        if name not in known:
+            raise InputError(_unknown(name, known))
+    merged = {**PRESETS[preset], **values}
+    # an explicit number of steps replaces the preset's time budget
+    if values.get("steps") is not None and "budget" not in values:
+        merged["budget"] = None
+    return SimplifyOptions(**{k: _converted(k, v) for k, v in merged.items()})
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """Keys of a job file, dashes or underscores. Raises InputError for unknown keys, suggesting the nearest."""
+    try:
+        import tomllib
+    except ModuleNotFoundError:  # Python 3.10
+        import tomli as tomllib
+    try:
+        data = tomllib.loads(Path(path).read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
+    except (ValueError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: not a valid TOML file ({error})") from error
+    known = {f.name for f in fields(SimplifyOptions)} | {"preset"}
+    out: dict[str, Any] = {}
+    for key, value in data.items():
+        name = key.replace("-", "_")
+        if name not in known:
+            raise InputError(f"{path}: {_unknown(key, known)}")
+        out[name] = value
+    return out
+
+
+def duration(text: str | float) -> float:
+    """Seconds of "90", "60s", "5m", "1.5h". Raises InputError."""
+    if isinstance(text, (int, float)):
+        return float(text)
+    match = re.fullmatch(r"\s*(\d+(?:\.\d*)?|\.\d+)\s*(s|sec|m|min|h)?\s*", text)
+    if match is None:
+        raise InputError(f"'{text}' is not a time: write 90, 60s, 5m or 1.5h")
+    return float(match[1]) * {"m": 60.0, "min": 60.0, "h": 3600.0}.get(match[2] or "s", 1.0)
+
+
+def as_dict(options: SimplifyOptions) -> dict[str, Any]:
+    """Plain values, for reports and fingerprints."""
+    return {f.name: getattr(options, f.name) for f in fields(options)}
+
+
+def with_values(options: SimplifyOptions, **values: Any) -> SimplifyOptions:
+    """The same options, but for ``values``."""
+    return replace(options, **values)
+
+
+def _converted(name: str, value: Any) -> Any:
+    if name == "budget" and value is not None:
+        return duration(value)
+    if name == "fit":
+        parts = value.split(",") if isinstance(value, str) else value
+        return tuple(dict.fromkeys(p.strip() for p in parts if p.strip()))
+    kinds: Mapping[str, tuple[type, ...]] = {"int": (int,), "float": (int, float), "str": (str,), "bool": (bool,)}
+    declared = str(next(f.type for f in fields(SimplifyOptions) if f.name == name))
+    allowed = tuple(k for word, types in kinds.items() if word in declared for k in types)
+    if value is None and "None" in declared:
+        return None
+    if allowed and (not isinstance(value, allowed) or (isinstance(value, bool) and bool not in allowed)):
+        raise InputError(f"--{name.replace('_', '-')} {value!r}: expected {declared}")
+    return value
+
+
+def _require(ok: bool, name: str, value: Any, expected: str) -> None:
+    if not ok:
+        raise InputError(f"--{name} {value}: must be {expected}")
+
+
+def _choice(name: str, value: str, allowed: tuple[str, ...]) -> None:
+    if value not in allowed:
+        close = difflib.get_close_matches(value, allowed, 1)
+        hint = f"; did you mean '{close[0]}'?" if close else ""
+        raise InputError(f"--{name} {value}: choose from {', '.join(allowed)}{hint}")
+
+
+def _unknown(name: str, known: set[str]) -> str:
+    close = difflib.get_close_matches(name.replace("-", "_"), sorted(known), 1, 0.4)
+    hint = f"; did you mean '{close[0].replace('_', '-')}'?" if close else ""
+    return f"unknown key '{name}'{hint}"

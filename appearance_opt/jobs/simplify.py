@@ -1,0 +1,236 @@
+"""The main job: a heavy asset in, a light one that looks the same out."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+import time
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from appearance_opt import backend
+from appearance_opt.asset import check_writable, load, save
+from appearance_opt.config import SimplifyOptions, as_dict
+from appearance_opt.errors import InputError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from appearance_opt.asset.types import Asset
+    from appearance_opt.fit.loop import FitResult, Progress
+    from appearance_opt.reference.mesh import MeshReference
+    from appearance_opt.views import ViewSampler
+
+log = logging.getLogger(__name__)
+
+VALIDATION_VIEWS = 8
+CHECKPOINT_SECONDS = 10.0
+
+EXPORT_SECONDS = 1.0
+"""Time kept back from the budget for writing the result; the report has a reserve of its own."""
+
+REPORT_SECONDS = 5.0
+
+
+@dataclass
+class SimplifyResult:
+    """What ``simplify`` did. ``asset``: the result; ``start``: the same before the fit; ``fit``: curve and
+    counts; ``seconds``: wall-clock time by stage; ``notes``: what the user should know."""
+
+    asset: Asset
+    start: Asset
+    fit: FitResult
+    triangles: int
+    source_triangles: int
+    seconds: dict[str, float] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+
+
+class Stopwatch:
+    """Seconds by stage."""
+
+    def __init__(self) -> None:
+        self.began = self._last = time.perf_counter()
+        self.stages: dict[str, float] = {}
+
+    def lap(self, stage: str) -> None:
+        """Everything since the last lap was ``stage``."""
+        now = time.perf_counter()
+        self.stages[stage] = self.stages.get(stage, 0.0) + now - self._last
+        self._last = now
+
+    @property
+    def total(self) -> float:
+        """Seconds since the start."""
+        return time.perf_counter() - self.began
+
+
+def simplify(
+    source: str | Path | Asset,
+    out: str | Path | None,
+    options: SimplifyOptions,
+    *,
+    report: str | Path | None = None,
+    checkpoint: str | Path | None = None,
+    resume: bool = False,
+    progress: Progress | None = None,
+) -> SimplifyResult:
+    """Simplify ``source`` (a path or an asset) and write the result to ``out`` (None: do not write).
+
+    ``report``: folder for pictures, metrics and report.html. ``checkpoint``: folder in which the state is kept
+    every few seconds; with ``resume`` a run goes on from there. Ctrl-C ends the fit early and still
+    writes the best state so far. Raises AppearanceError.
+    """
+    watch = Stopwatch()
+    if out is not None:
+        check_writable(Path(out))
+        if not isinstance(source, _asset_type()) and Path(out).resolve() == Path(source).resolve():
+            raise InputError(f"{out}: is the input itself, which is never changed; choose another name")
+    asset = source if isinstance(source, _asset_type()) else load(source, subdivision=options.subdivision)
+    watch.lap("load")
+    backend.select(options.device)
+    run = _Job(asset, options, watch)
+    result = run.fit(progress, _checkpointer(asset, options, checkpoint, resume), report is not None)
+    if out is not None:
+        save(result.asset, out)
+        watch.lap("write")
+    if report is not None:
+        from appearance_opt.jobs.report import write_simplify_report
+
+        write_simplify_report(Path(report), asset, result, run.sampler, run.frame, options)
+        watch.lap("report")
+    result.seconds = {**watch.stages, "total": watch.total}
+    return result
+
+
+class _Job:
+    """The reference, its frame and the start; then the fit."""
+
+    def __init__(self, asset: Asset, options: SimplifyOptions, watch: Stopwatch) -> None:
+        from appearance_opt.jobs.start import budget, loaded_start, make_start
+        from appearance_opt.reference.mesh import MeshReference
+        from appearance_opt.views import ViewSampler, framing
+
+        self.options, self.watch = options, watch
+        points = np.concatenate([m.positions for m in asset.meshes])
+        self.frame = framing(points)
+        # the fit works on an object of radius 1 around the origin, so that no threshold in it and no
+        # digit of a float depends on the scale and place of the input
+        self.reference = MeshReference(in_frame(asset, *self.frame))
+        watch.lap("reference")
+        self.sampler = ViewSampler(
+            (0.0, 0.0, 0.0), 1.0, options.seed, hull=support(self.reference.merged.positions), light=options.light
+        )
+        triangles = budget(options, asset.triangle_count)
+        if options.init in ("decimate", "sphere"):
+            self.start = make_start(self.reference, options, self.sampler, triangles)
+        else:
+            self.start = loaded_start(Path(options.init), (np.array(self.frame[0]), self.frame[1]), self.reference, options)
+        self.asset = asset
+        watch.lap("start")
+
+    def fit(self, progress: Progress | None, checkpointer, with_report: bool) -> SimplifyResult:  # noqa: ANN001
+        from appearance_opt.fit.loop import FitOptions, fit
+        from appearance_opt.fit.model import Model, Rates
+        from appearance_opt.fit.validation import Validation
+        from appearance_opt.latent.export import to_asset
+        from appearance_opt.reference.pool import ReferencePool
+
+        o = self.options
+        rates = Rates(o.position_rate, o.normal_rate, o.color_rate, o.material_rate)
+        model = Model(self.start.mesh, self.start.maps, frozenset(o.fit), rates)
+        pool = ReferencePool(self.reference, self.sampler, o.pool, o.views, o.resolution, samples=4)
+        held_out = self.sampler.held_out(1).draw(0, VALIDATION_VIEWS)
+        validation = Validation(self.reference, held_out, min(o.resolution, 256))
+        self.watch.lap("set-up")
+        seconds = None
+        if o.budget is not None:
+            reserve = EXPORT_SECONDS + (REPORT_SECONDS if with_report else 0.0)
+            seconds = max(o.budget - self.watch.total - reserve, 0.0)
+        relative = self.start.relative if o.relative is None else o.relative
+        fit_options = FitOptions(
+            steps=o.steps if seconds is not None or o.steps is not None else 1000,
+            seconds=seconds,
+            loss=o.loss,
+            laplacian=o.laplacian,
+            relative=relative,
+            background=o.background_color(),
+            seed=o.seed,
+        )
+        fitted = fit(model, pool, validation, fit_options, progress, checkpointer)
+        self.watch.lap("fit")
+        centre, scale = np.array(self.frame[0]), self.frame[1]
+
+        def export(positions: NDArray, maps: dict) -> Asset:
+            name = f"{self.asset.name}_{len(self.start.mesh.faces)}"
+            double_sided = any(m.material.double_sided for m in self.asset.meshes)
+            return to_asset(self.start.mesh, positions.astype(np.float64) * scale + centre, maps, name, double_sided)
+
+        begin = export(self.start.mesh.positions, self.start.maps)
+        result = export(model.host_positions(), clean_maps(model, self.start.known))
+        self.watch.lap("export")
+        notes = list(self.asset.notes)
+        if fitted.skipped:
+            notes.append(f"{fitted.skipped} steps with non-finite gradients were skipped")
+        if fitted.interrupted:
+            notes.append(f"interrupted after {fitted.steps} steps: this is the best state so far")
+        return SimplifyResult(result, begin, fitted, len(self.start.mesh.faces), self.asset.triangle_count, notes=notes)
+
+
+def clean_maps(model, known: NDArray) -> dict:  # noqa: ANN001 - fit.model.Model
+    """The model's maps and constants, texels outside of all charts filled from the inside."""
+    from appearance_opt.initial.fill import fill
+    from appearance_opt.initial.transfer import texel_coverage
+
+    maps = model.host_maps()
+    out: dict = dict(model.constants)
+    if not maps:
+        return out
+    names = list(maps)
+    inside = texel_coverage(model.topology.mesh, len(maps[names[0]]))
+    seen = model.touched(inside, known)
+    stacked = fill(np.stack([maps[n] for n in names], axis=-1), seen)
+    out.update({n: stacked[..., k] for k, n in enumerate(names)})
+    return out
+
+
+def in_frame(asset: Asset, centre: tuple[float, float, float], scale: float) -> Asset:
+    """The asset moved by -centre and divided by scale (computed in double precision)."""
+    c = np.asarray(centre)
+    moved = [replace(m, positions=((m.positions.astype(np.float64) - c) / scale).astype(np.float32)) for m in asset.meshes]
+    return replace(asset, meshes=tuple(moved))
+
+
+def support(positions: NDArray, count: int = 256) -> NDArray[np.float64]:
+    """Extreme points of a cloud in ``count`` directions: enough to frame it from any side."""
+    k = np.arange(count) + 0.5
+    polar, azimuth = np.arccos(1 - 2 * k / count), np.pi * (1 + 5**0.5) * k
+    directions = np.stack(
+        [np.cos(azimuth) * np.sin(polar), np.sin(azimuth) * np.sin(polar), np.cos(polar)], axis=1
+    ).astype(np.float32)
+    best = np.concatenate([np.argmax(positions @ d.T, axis=0) for d in np.split(directions, 8)])
+    return positions[np.unique(best)].astype(np.float64)
+
+
+def _checkpointer(asset: Asset, options: SimplifyOptions, folder: str | Path | None, resume: bool):  # noqa: ANN202
+    if folder is None:
+        if resume:
+            raise InputError("--resume needs --checkpoint DIR")
+        return None
+    from appearance_opt.fit.checkpoint import Checkpointer
+
+    digest = hashlib.sha256(json.dumps(as_dict(options), sort_keys=True).encode())
+    for mesh in asset.meshes:
+        digest.update(mesh.positions.tobytes())
+        digest.update(mesh.faces.tobytes())
+    return Checkpointer(Path(folder), digest.hexdigest(), resume, CHECKPOINT_SECONDS)
+
+
+def _asset_type() -> type:
+    from appearance_opt.asset.types import Asset
+
+    return Asset

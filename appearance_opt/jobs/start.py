@@ -1,0 +1,96 @@
+"""The start of a fit: a mesh with an atlas and maps, from what the options ask for."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from appearance_opt.errors import InputError
+from appearance_opt.initial.atlas import unwrap
+from appearance_opt.initial.decimate import decimate
+from appearance_opt.initial.sphere import random_maps, sphere
+from appearance_opt.initial.transfer import transfer
+from appearance_opt.initial.visibility import importance, pixel_counts
+from appearance_opt.latent.latent import LatentMesh
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from appearance_opt.config import SimplifyOptions
+    from appearance_opt.reference.mesh import MeshReference
+    from appearance_opt.views import ViewSampler
+
+log = logging.getLogger(__name__)
+
+VISIBILITY_VIEWS = 160
+
+
+@dataclass(frozen=True)
+class Start:
+    """``maps``: channel name -> image or number; ``relative``: may the Laplacian keep this shape?
+    ``known``: texels whose values mean something."""
+
+    mesh: LatentMesh
+    maps: dict[str, NDArray | float]
+    relative: bool
+    known: NDArray[np.bool_]
+
+
+def budget(options: SimplifyOptions, available: int) -> int:
+    """Triangles asked for. Raises InputError when the input has fewer."""
+    count = options.triangles
+    if count is None:
+        assert options.ratio is not None
+        count = max(4, round(options.ratio * available))
+    if count > available:
+        raise InputError(f"--triangles {count}: the input has only {available} triangles; ask for fewer")
+    return count
+
+
+def make_start(reference: MeshReference, options: SimplifyOptions, sampler: ViewSampler, triangles: int) -> Start:
+    """Sphere, decimated reference, or the mesh of another file (in the reference's frame)."""
+    size = options.texture_size
+    if options.init == "sphere":
+        mesh = sphere(triangles, sampler.centre, 0.6 * sampler.radius, size)
+        maps = random_maps(size, options.seed, "normal" in options.fit)
+        return Start(mesh, maps, False, np.zeros((size, size), bool))
+    merged = reference.merged
+    faces = merged.faces
+    weight = None
+    if not options.keep_hidden:
+        counts = pixel_counts(reference.scene, len(faces), sampler.held_out(2), VISIBILITY_VIEWS)
+        weight, visible = importance(merged.positions, faces, counts)
+        if visible.sum() >= triangles:
+            faces, weight = faces[visible], weight[visible]
+    positions, low = decimate(merged.positions, faces, triangles, weight)
+    if not len(low):
+        raise InputError("nothing is left of this mesh at that budget; ask for more triangles")
+    return transferred(reference, unwrap(positions, low, size), size)
+
+
+def transferred(reference: MeshReference, mesh: LatentMesh, size: int) -> Start:
+    """A mesh with the reference's appearance in its maps."""
+    result = transfer(reference, mesh, size)
+    missed = result.missed.sum() / max(result.covered.sum(), 1)
+    if missed > 0.01:
+        log.warning("the transfer found no reference point for %.1f %% of the texels; they were filled", 100 * missed)
+    return Start(mesh, dict(result.maps), True, result.covered)
+
+
+def loaded_start(path: Path, to_fit_frame: tuple[NDArray, float], reference: MeshReference, options: SimplifyOptions) -> Start:
+    """The mesh of a file as a start: its shape is kept, atlas and maps are made anew."""
+    from appearance_opt.asset import load
+    from appearance_opt.asset.normals import weld
+
+    asset = load(path, subdivision=options.subdivision)
+    offsets = np.cumsum([0] + [len(m.positions) for m in asset.meshes[:-1]])
+    p = np.concatenate([m.positions for m in asset.meshes]).astype(np.float64)
+    f = np.concatenate([m.faces + o for m, o in zip(asset.meshes, offsets, strict=True)])
+    first, place = weld(p)
+    centre, scale = to_fit_frame
+    mesh = unwrap((p[first] - centre) / scale, place[f].astype(np.int32), options.texture_size)
+    return transferred(reference, mesh, options.texture_size)

@@ -1,0 +1,84 @@
+"""From a fitted latent back to an asset."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from appearance_opt.asset.normals import vertex_normals
+from appearance_opt.asset.tangents import split_and_tangents
+from appearance_opt.asset.types import Asset, Material, Mesh, Texture
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from numpy.typing import NDArray
+
+    from appearance_opt.latent.latent import LatentMesh
+
+
+def to_asset(
+    mesh: LatentMesh, positions: NDArray, maps: Mapping[str, NDArray | float], name: str, double_sided: bool = True
+) -> Asset:
+    """One mesh, one material. ``positions`` (V, 3); ``maps``: natural values by channel name, images or
+    numbers. Normals are angle weighted and tangents MikkTSpace's: what the renderer of the fit uses, so
+    that the maps mean the same in another one."""
+    normals = vertex_normals(positions, mesh.faces, welded=True)
+    p, n, uv = positions[mesh.frame_vertex], normals[mesh.frame_vertex], mesh.uvs
+    faces, tangents = mesh.frame_faces, None
+    if np.ndim(maps.get("normal_x", 0.0)):
+        index, faces, tangents = split_and_tangents(p, n, uv, faces)
+        p, n, uv = p[index], n[index], uv[index]
+    return Asset(
+        (
+            Mesh(
+                positions=np.ascontiguousarray(p, np.float32),
+                faces=np.ascontiguousarray(faces, np.int32),
+                normals=n,
+                uvs=uv,
+                tangents=tangents,
+                material=_material(maps, name, double_sided),
+                name=name,
+            ),
+        ),
+        name,
+    )
+
+
+def _material(maps: Mapping[str, NDArray | float], name: str, double_sided: bool) -> Material:
+    def stacked(*names: str) -> NDArray | None:
+        values = [np.asarray(maps.get(n, 0.0), np.float32) for n in names]
+        shapes = [v.shape for v in values if v.ndim]
+        return np.stack([np.broadcast_to(v, shapes[0]) for v in values], axis=-1) if shapes else None
+
+    base = stacked("red", "green", "blue")
+    rough_metal = stacked("roughness", "metalness")
+    normal = stacked("normal_x", "normal_y", "normal_z")
+    orm = None
+    if rough_metal is not None:
+        orm = np.concatenate([np.ones((*rough_metal.shape[:2], 1), np.float32), rough_metal], axis=-1)
+    if normal is not None:
+        normal = normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-6)
+    color = tuple(float(maps.get(c, 0.5)) if base is None else 1.0 for c in ("red", "green", "blue"))
+    clamp = ("clamp", "clamp")
+    return Material(
+        name=name,
+        base_color=color,  # type: ignore[arg-type]
+        roughness=1.0 if orm is not None else float(maps.get("roughness", 0.5)),
+        metalness=1.0 if orm is not None else float(maps.get("metalness", 0.0)),
+        base_color_texture=None if base is None else Texture(_srgb8(base), "srgb", clamp),  # type: ignore[arg-type]
+        orm_texture=None if orm is None else Texture(_8(orm), "linear", clamp),  # type: ignore[arg-type]
+        normal_texture=None if normal is None else Texture(_8(normal * 0.5 + 0.5), "linear", clamp),  # type: ignore[arg-type]
+        double_sided=double_sided,
+    )
+
+
+def _8(x: NDArray) -> NDArray[np.uint8]:
+    return (np.clip(x, 0, 1) * 255 + 0.5).astype(np.uint8)
+
+
+def _srgb8(x: NDArray) -> NDArray[np.uint8]:
+    from appearance_opt.asset.types import linear_to_srgb
+
+    return _8(linear_to_srgb(np.clip(x, 0, 1)))
