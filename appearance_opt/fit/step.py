@@ -61,11 +61,11 @@ def gradients(
         dr.enable_grad(layer.pyramid.texels)
     maps = model.maps(layer)
     edges = model.topology.edges
-    frame = gradient.render(model.scene, surface, maps, edges if moving else None, records, grid, quality, inputs.seed)
+    frame = gradient.render(model.scene, surface, maps, edges, records, grid, quality, inputs.seed)
     behind = np.concatenate([inputs.background, np.zeros((len(inputs.background), 1))], axis=1)
     background = mi.Float(np.ascontiguousarray(behind, np.float32).ravel())
     value, by_image = image_loss(loss, frame.image, inputs.reference, background, grid.resolution**2)
-    objective = gradient.surrogate(frame, surface, maps, edges, by_image)
+    objective = gradient.surrogate(frame, surface, maps, edges, by_image, quality)
     if moving and laplacian is not None:
         objective += laplacian(positions) * dr.opaque(mi.Float, inputs.laplacian_weight)
     out: dict[str, mi.Float] = {}

@@ -1,0 +1,1 @@
+"""First guesses: decimated mesh or sphere, UV atlas, closed-form transfer."""

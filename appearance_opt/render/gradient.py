@@ -32,6 +32,8 @@ class Quality:
 
     edge_density: float = 1.0
     edge_samples: int = 8
+    samples: int = 1
+    sample_width: float = 0.7
 
 
 @dataclass
@@ -70,11 +72,10 @@ def render(
             edges = silhouette.sample_edges(
                 scene, edge_list, surface.vertices, records, grid, quality.edge_density, seed
             )
-        samples, pixel, weight = _camera_samples(scene, records, grid, edges, quality.edge_samples)
+        samples, pixel, weight = _camera_samples(scene, records, grid, edges, quality)
         image = dr.zeros(mi.Float, grid.pixels * 4)
         if samples is not None:
-            width = dr.opaque(mi.Float, 1.0)
-            c = shade(surface, maps, records, samples, grid.size, width)
+            c = shade(surface, maps, records, samples, grid.size, _width(weight, quality))
             value = mi.ArrayXf([c.x * weight, c.y * weight, c.z * weight, weight])
             dr.scatter_reduce(dr.ReduceOp.Add, image, value, pixel, mode=dr.ReduceMode.Local)
         contrast = None if edges is None else _contrast(surface, maps, records, edges, grid.size)
@@ -83,7 +84,7 @@ def render(
 
 
 def surrogate(
-    frame: Frame, surface: Surface, maps: MaterialMaps, edge_list: EdgeList | None, image_gradient: mi.Float
+    frame: Frame, surface: Surface, maps: MaterialMaps, edge_list: EdgeList | None, image_gradient: mi.Float, quality: Quality
 ) -> mi.Float:
     """Scalar whose derivative is the loss's, for ``image_gradient`` = dLoss/dImage (pixels * 4).
 
@@ -93,7 +94,7 @@ def surrogate(
     total = mi.Float(0)
     if frame.samples is not None:
         assert frame.pixel is not None and frame.weight is not None
-        color = shade(surface, maps, frame.records, frame.samples, size, dr.opaque(mi.Float, 1.0))
+        color = shade(surface, maps, frame.records, frame.samples, size, _width(frame.weight, quality))
         g = _pixel(image_gradient, frame.pixel)
         total += dr.sum(dr.fma(g[0], color.x, dr.fma(g[1], color.y, g[2] * color.z)) * frame.weight)
     if frame.edges is not None and edge_list is not None and dr.grad_enabled(surface.vertices):
@@ -105,68 +106,67 @@ def surrogate(
     return total
 
 
+def _width(weight: mi.Float, quality: Quality) -> mi.Float:
+    """Width in pixels of camera samples with the given share of their pixel."""
+    return dr.sqrt(weight) * dr.opaque(mi.Float, quality.sample_width)
+
+
 def _camera_samples(
     scene: mi.Scene,
     records: mi.Float,
     grid: Grid,
     edges: EdgeSamples | None,
-    edge_samples: int,
+    quality: Quality,
 ) -> tuple[Samples | None, mi.UInt32 | None, mi.Float | None]:
-    """Covered camera rays: one in the middle of each pixel, ``edge_samples`` where a silhouette passes."""
-    hits = rays.trace(scene, records, grid.view, mi.Float(grid.column) + 0.5, mi.Float(grid.row) + 0.5, grid.size)
-    covered = hits.triangle != MISS
-    pixel = pixel_index(hits, grid.rows)
-    if edges is None or edge_samples <= 1:
-        index = dr.compress(covered)
-        if dr.width(index) == 0:
-            return None, None, None
-        samples = rays.keep(hits, index)
-        return samples, dr.gather(mi.UInt32, pixel, index), dr.full(mi.Float, 1, dr.width(index))
+    """Covered camera rays: ``samples`` in each pixel, ``edge_samples`` where a silhouette passes."""
     crossed = dr.zeros(mi.Bool, grid.pixels)
-    dr.scatter(crossed, mi.Bool(True), edges.pixel)
+    if edges is not None:
+        dr.scatter(crossed, mi.Bool(True), edges.pixel)
+    pixel = (grid.view * grid.rows + grid.row) * grid.rows + grid.column
     on_edge = dr.gather(mi.Bool, crossed, pixel)
-    dr.eval(hits, pixel, on_edge)
-    index = dr.compress(covered & ~on_edge)
-    plain = rays.keep(hits, index)
-    fine = _fine_samples(scene, records, hits, dr.compress(on_edge), grid.size, edge_samples)
-    samples = _concat(plain, fine)
-    weight = dr.concat(
-        [dr.full(mi.Float, 1, dr.width(index)), dr.full(mi.Float, 1 / edge_samples, dr.width(fine.triangle))]
-    )
-    if dr.width(samples.triangle) == 0:
+    parts, weights = [], []
+    for dx, dy in rays.sub_pixel_offsets(quality.samples):
+        x, y = mi.Float(grid.column) + dr.opaque(mi.Float, dx), mi.Float(grid.row) + dr.opaque(mi.Float, dy)
+        hits = rays.trace(scene, records, grid.view, x, y, grid.size)
+        dr.eval(hits, on_edge)
+        parts.append(rays.keep(hits, dr.compress((hits.triangle != MISS) & ~on_edge)))
+        weights.append(1 / quality.samples)
+    if edges is not None:
+        parts.append(_fine_samples(scene, records, grid, dr.compress(on_edge), quality.edge_samples))
+        weights.append(1 / quality.edge_samples)
+    parts_weights = [(p, w) for p, w in zip(parts, weights, strict=True) if dr.width(p.triangle)]
+    if not parts_weights:
         return None, None, None
+    samples = _concat([p for p, _ in parts_weights])
+    weight = dr.concat([dr.full(mi.Float, w, dr.width(p.triangle)) for p, w in parts_weights])
     dr.eval(samples, weight)
     return samples, pixel_index(samples, grid.rows), weight
 
 
-def _fine_samples(
-    scene: mi.Scene, records: mi.Float, hits: Samples, index: mi.UInt32, size: mi.Float, count: int
-) -> Samples:
+def _fine_samples(scene: mi.Scene, records: mi.Float, grid: Grid, index: mi.UInt32, count: int) -> Samples:
     """The hits among ``count`` rays in each of the given pixels."""
     offsets = mi.Float(rays.sub_pixel_offsets(count).ravel())
     i = dr.arange(mi.UInt32, dr.width(index) * count)
     k = i // count
     at = dr.gather(mi.UInt32, index, k)
     offset = 2 * (i - k * count)
-    x = dr.floor(dr.gather(mi.Float, hits.x, at)) + dr.gather(mi.Float, offsets, offset)
-    y = dr.floor(dr.gather(mi.Float, hits.y, at)) + dr.gather(mi.Float, offsets, offset + 1)
-    fine = rays.trace(scene, records, dr.gather(mi.UInt32, hits.view, at), x, y, size)
+    x = mi.Float(dr.gather(mi.UInt32, grid.column, at)) + dr.gather(mi.Float, offsets, offset)
+    y = mi.Float(dr.gather(mi.UInt32, grid.row, at)) + dr.gather(mi.Float, offsets, offset + 1)
+    fine = rays.trace(scene, records, dr.gather(mi.UInt32, grid.view, at), x, y, grid.size)
     return rays.keep(fine, dr.compress(fine.triangle != MISS))
 
 
-def _concat(a: Samples, b: Samples) -> Samples:
-    if dr.width(a.triangle) == 0:
-        return b
-    if dr.width(b.triangle) == 0:
-        return a
-    return Samples(*(dr.concat([getattr(a, f), getattr(b, f)]) for f in ("view", "x", "y", "triangle")))
+def _concat(parts: list[Samples]) -> Samples:
+    if len(parts) == 1:
+        return parts[0]
+    return Samples(*(dr.concat([getattr(p, f) for p in parts]) for f in ("view", "x", "y", "triangle")))
 
 
 def _contrast(
     surface: Surface, maps: MaterialMaps, records: mi.Float, edges: EdgeSamples, size: mi.Float
 ) -> mi.ArrayXf:
     """c_in - c_out at the silhouette points: premultiplied RGB and coverage."""
-    both = _concat(edges.inside, edges.outside)
+    both = _concat([edges.inside, edges.outside])
     covered = both.triangle != MISS
     both = Samples(both.view, both.x, both.y, dr.select(covered, both.triangle, 0))
     color = shade(surface, maps, records, both, size, dr.opaque(mi.Float, 1.0)) & covered

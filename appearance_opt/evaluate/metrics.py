@@ -1,0 +1,79 @@
+"""How different do two sets of images look?"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from appearance_opt.asset.types import linear_to_srgb
+
+BACKGROUND = 0.18
+"""Linear grey behind both images."""
+
+BEST_PSNR = 99.0
+
+
+@dataclass(frozen=True)
+class ViewMetrics:
+    """One view. PSNR in dB of sRGB display values in [0, 1], over the whole image and over the pixels that
+    either image covers; mean FLIP (Andersson et al. 2020, LDR); intersection over union of the silhouettes;
+    mean distance in pixels by which they differ (difference in coverage over the reference's outline)."""
+
+    psnr: float
+    psnr_covered: float
+    flip: float
+    silhouette_iou: float
+    silhouette_shift: float
+
+
+@dataclass(frozen=True)
+class Metrics:
+    """Means over views, and each view."""
+
+    psnr: float
+    psnr_covered: float
+    flip: float
+    silhouette_iou: float
+    silhouette_shift: float
+    views: tuple[ViewMetrics, ...]
+
+
+def display(image: NDArray) -> NDArray[np.float32]:
+    """(..., 4) premultiplied linear radiance and coverage to (..., 3) sRGB values over grey."""
+    return linear_to_srgb(np.clip(image[..., :3] + BACKGROUND * (1 - image[..., 3:]), 0, 1).astype(np.float32))
+
+
+def compare_images(reference: NDArray, candidate: NDArray) -> Metrics:
+    """Metrics of (B, H, W, 4) images, premultiplied linear radiance and coverage. Raises ValueError for
+    shapes that differ."""
+    if reference.shape != candidate.shape:
+        raise ValueError(f"images differ in shape: {reference.shape} and {candidate.shape}")
+    views = tuple(_view(r, c) for r, c in zip(reference, candidate, strict=True))
+    names = ("psnr", "psnr_covered", "flip", "silhouette_iou", "silhouette_shift")
+    return Metrics(*(float(np.mean([getattr(v, n) for v in views])) for n in names), views)
+
+
+def _view(reference: NDArray, candidate: NDArray) -> ViewMetrics:
+    import flip_evaluator
+
+    a, b = display(reference), display(candidate)
+    error = np.mean((a - b) ** 2, axis=-1)
+    covered = (reference[..., 3] > 0) | (candidate[..., 3] > 0)
+    _, flip, _ = flip_evaluator.evaluate(a, b, "LDR", inputsRGB=True)
+    inside, other = reference[..., 3] > 0.5, candidate[..., 3] > 0.5
+    outline = int((inside[1:] != inside[:-1]).sum() + (inside[:, 1:] != inside[:, :-1]).sum())
+    return ViewMetrics(
+        psnr=_psnr(float(error.mean())),
+        psnr_covered=_psnr(float(error[covered].mean()) if covered.any() else 0.0),
+        flip=float(flip),
+        silhouette_iou=float((inside & other).sum() / max((inside | other).sum(), 1)),
+        silhouette_shift=float(np.abs(reference[..., 3] - candidate[..., 3]).sum() / max(outline, 1)),
+    )
+
+
+def _psnr(mean_squared_error: float) -> float:
+    if mean_squared_error <= 0:
+        return BEST_PSNR
+    return float(min(BEST_PSNR, -10 * np.log10(mean_squared_error)))

@@ -1,0 +1,54 @@
+"""Pictures for people: 8-bit RGB arrays from images and maps."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from appearance_opt.asset.types import Asset, linear_to_srgb
+from appearance_opt.evaluate.metrics import display
+
+DIFFERENCE_GAIN = 4.0
+
+
+def picture(image: NDArray) -> NDArray[np.uint8]:
+    """(H, W, 4) premultiplied linear radiance and coverage, over grey."""
+    return _bytes(display(image))
+
+
+def difference(a: NDArray, b: NDArray) -> NDArray[np.uint8]:
+    """Absolute difference of display values, four times as bright."""
+    return _bytes(np.abs(display(a) - display(b)) * DIFFERENCE_GAIN)
+
+
+def wireframe(image: NDArray, triangle: NDArray) -> NDArray[np.uint8]:
+    """``image`` with lines between pixels that show different triangles. ``triangle``: (H, W) index, -1
+    where nothing is seen; may be twice as fine as the image, or any multiple."""
+    edge = np.zeros(triangle.shape, bool)
+    edge[1:] |= triangle[1:] != triangle[:-1]
+    edge[:, 1:] |= triangle[:, 1:] != triangle[:, :-1]
+    factor = triangle.shape[0] // image.shape[0]
+    share = edge.reshape(image.shape[0], factor, image.shape[1], factor).mean(axis=(1, 3))
+    line = np.clip(share * 1.5, 0, 1)[..., None] * (image[..., 3:] > 0)
+    base = 0.35 + 0.65 * display(image)
+    return _bytes(base * (1 - line) + line * np.array([0.05, 0.12, 0.3]))
+
+
+def texture_pictures(asset: Asset) -> dict[str, NDArray[np.uint8]]:
+    """The maps of an asset's first material as they are stored, by name."""
+    m = asset.meshes[0].material
+    named = {"base colour": m.base_color_texture, "roughness, metalness": m.orm_texture, "normal": m.normal_texture}
+    out = {}
+    for name, texture in named.items():
+        if texture is not None:
+            pixels = texture.pixels[..., :3]
+            out[name] = pixels if pixels.dtype == np.uint8 else _bytes(_encoded(texture.linear()[..., :3], name))
+    return out
+
+
+def _encoded(linear: NDArray, name: str) -> NDArray:
+    return linear_to_srgb(np.clip(linear, 0, 1)) if name == "base colour" else linear
+
+
+def _bytes(x: NDArray) -> NDArray[np.uint8]:
+    return (np.clip(x, 0, 1) * 255 + 0.5).astype(np.uint8)

@@ -1,0 +1,1 @@
+"""Losses, regularizer, optimiser, schedules, and the loop."""

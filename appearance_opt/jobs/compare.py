@@ -1,0 +1,83 @@
+"""Two assets, the same views and lights: how different do they look?"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from appearance_opt import backend
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from appearance_opt.asset.types import Asset
+    from appearance_opt.evaluate.metrics import Metrics
+    from appearance_opt.views import ViewSampler, Views
+
+HELD_OUT_STREAM = 3
+"""Stream of random views that no fit draws from."""
+
+
+@dataclass
+class Comparison:
+    """``metrics`` over the views; images (B, H, W, 4) premultiplied linear radiance and coverage."""
+
+    metrics: Metrics
+    reference: NDArray[np.float32]
+    candidate: NDArray[np.float32]
+
+
+def compare(
+    reference: str | Path | Asset,
+    candidate: str | Path | Asset,
+    *,
+    views: int = 12,
+    resolution: int = 384,
+    samples: int = 16,
+    seed: int = 0,
+    device: str = "auto",
+    out: str | Path | None = None,
+) -> Comparison:
+    """Render both assets from ``views`` random cameras under random lights and measure the difference.
+    ``out``: folder for a report with pictures. Raises AppearanceError."""
+    from appearance_opt.asset import load
+    from appearance_opt.asset.types import Asset
+
+    first = reference if isinstance(reference, Asset) else load(reference)
+    second = candidate if isinstance(candidate, Asset) else load(candidate)
+    backend.select(device)
+    from appearance_opt.jobs.simplify import in_frame, support
+    from appearance_opt.views import ViewSampler, framing
+
+    points = np.concatenate([m.positions for a in (first, second) for m in a.meshes])
+    frame = framing(points)
+    hull = support(((points.astype(np.float64) - np.array(frame[0])) / frame[1]).astype(np.float32))
+    sampler = ViewSampler((0.0, 0.0, 0.0), 1.0, seed, stream=HELD_OUT_STREAM, hull=hull)
+    result = compare_in_frame(in_frame(first, *frame), in_frame(second, *frame), sampler, views, resolution, samples)
+    if out is not None:
+        from appearance_opt.jobs.report import write_compare_report
+
+        write_compare_report(Path(out), first, second, result)
+    return result
+
+
+def compare_in_frame(
+    reference: Asset, candidate: Asset, sampler: ViewSampler, views: int, resolution: int, samples: int
+) -> Comparison:
+    """The same for assets that lie in the sampler's frame."""
+    from appearance_opt.evaluate.metrics import compare_images
+
+    drawn = sampler.draw(0, views)
+    images = [render_asset(a, drawn, resolution, samples) for a in (reference, candidate)]
+    return Comparison(compare_images(*images), *images)
+
+
+def render_asset(asset: Asset, views: Views, resolution: int, samples: int) -> NDArray[np.float32]:
+    """Images (B, H, W, 4) of an asset; the device memory of its textures is released afterwards."""
+    from appearance_opt.reference.mesh import MeshReference
+    from appearance_opt.reference.pool import checked
+
+    return checked(MeshReference(asset).render(views, resolution, samples), asset.name)

@@ -1,0 +1,118 @@
+"""Reports of the jobs: held-out views rendered, measured, and written."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from appearance_opt import backend
+from appearance_opt.config import as_dict
+from appearance_opt.evaluate import pictures
+from appearance_opt.evaluate.metrics import compare_images
+from appearance_opt.evaluate.report import ReportData, write_report
+from appearance_opt.jobs.compare import HELD_OUT_STREAM, Comparison, render_asset
+from appearance_opt.reference.mesh import MeshReference
+from appearance_opt.render.rays import MISS, trace
+from appearance_opt.views import Views
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from appearance_opt.asset.types import Asset
+    from appearance_opt.config import SimplifyOptions
+    from appearance_opt.jobs.simplify import SimplifyResult
+    from appearance_opt.views import ViewSampler
+
+VIEWS, RESOLUTION, SAMPLES = 8, 384, 9
+PICTURED = 4
+
+
+def write_simplify_report(
+    folder: Path,
+    source: Asset,
+    result: SimplifyResult,
+    sampler: ViewSampler,
+    frame: tuple[tuple[float, float, float], float],
+    options: SimplifyOptions,
+) -> None:
+    """Report of a simplification: start and result against the source."""
+    from appearance_opt.jobs.simplify import in_frame
+
+    views = sampler.held_out(HELD_OUT_STREAM).draw(0, VIEWS)
+    images = {
+        name: render_asset(in_frame(asset, *frame), views, RESOLUTION, SAMPLES)
+        for name, asset in (("reference", source), ("start", result.start), ("result", result.asset))
+    }
+    triangles = triangle_images(in_frame(result.asset, *frame), views[:PICTURED], 2 * RESOLUTION)
+    metrics = {n: compare_images(images["reference"], images[n]) for n in ("start", "result")}
+    per_view = []
+    for k in range(PICTURED):
+        r, s, a = (images[n][k] for n in ("reference", "start", "result"))
+        per_view.append(
+            {
+                "reference": pictures.picture(r),
+                "result": pictures.picture(a),
+                "difference x 4": pictures.difference(r, a),
+                "wireframe": pictures.wireframe(a, triangles[k]),
+                "start": pictures.picture(s),
+                "start's difference x 4": pictures.difference(r, s),
+            }
+        )
+    data = ReportData(
+        title=f"{source.name}: {result.source_triangles:,} to {result.triangles:,} triangles",
+        facts=_facts(result, options),
+        metrics=metrics,
+        views=per_view,
+        maps=pictures.texture_pictures(result.asset),
+        curve=[(p.seconds, p.step, p.psnr, p.loss) for p in result.fit.curve],
+        notes=result.notes,
+    )
+    write_report(folder, data)
+
+
+def write_compare_report(folder: Path, reference: Asset, candidate: Asset, result: Comparison) -> None:
+    """Report of a comparison."""
+    per_view = []
+    for r, c in zip(result.reference, result.candidate, strict=True):
+        shown = {"reference": pictures.picture(r), "result": pictures.picture(c)}
+        per_view.append({**shown, "difference x 4": pictures.difference(r, c)})
+    data = ReportData(
+        title=f"{candidate.name} against {reference.name}",
+        facts={"reference triangles": reference.triangle_count, "candidate triangles": candidate.triangle_count},
+        metrics={"candidate": result.metrics},
+        views=per_view,
+        notes=[*reference.notes, *candidate.notes],
+    )
+    write_report(folder, data)
+
+
+def triangle_images(asset: Asset, views: Views, resolution: int) -> NDArray[np.int64]:
+    """(B, H, W) index of the triangle seen in each pixel, -1 for none."""
+    import mitsuba as mi
+
+    scene = MeshReference(asset).scene
+    count = resolution * resolution
+    out = []
+    y, x = np.divmod(np.arange(count), resolution)
+    for k in range(len(views)):
+        view = mi.UInt32(np.zeros(count, np.uint32))
+        px, py = mi.Float((x + 0.5).astype(np.float32)), mi.Float((y + 0.5).astype(np.float32))
+        hits = trace(scene, views[k : k + 1].records(), view, px, py, mi.Float(resolution))
+        triangle = np.array(hits.triangle).astype(np.int64)
+        out.append(np.where(triangle == MISS, -1, triangle).reshape(resolution, resolution))
+    return np.stack(out)
+
+
+def _facts(result: SimplifyResult, options: SimplifyOptions) -> dict[str, object]:
+    fit = result.fit
+    facts: dict[str, object] = {
+        "triangles": f"{result.triangles} of {result.source_triangles}",
+        "steps": f"{fit.steps} ({fit.steps / max(fit.seconds, 1e-9):.1f} per second), best at {fit.best_step}",
+        "skipped steps": fit.skipped,
+        "seconds by stage": ", ".join(f"{k} {v:.1f}" for k, v in result.seconds.items()),
+    }
+    facts.update({f"option {k.replace('_', ' ')}": v for k, v in as_dict(options).items() if v is not None})
+    facts.update({f"version of {k}": v for k, v in backend.versions().items()})
+    return facts

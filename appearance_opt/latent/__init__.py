@@ -1,0 +1,1 @@
+"""What is fitted: parameter records and differentiable mesh operations."""

@@ -1,0 +1,1 @@
+"""Reference renderers: black boxes that take views and hand out linear images."""

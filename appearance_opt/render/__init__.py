@@ -1,0 +1,1 @@
+"""The differentiable deferred renderer: surface, material and views to an image, and back."""
