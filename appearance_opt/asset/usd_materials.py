@@ -1,0 +1,206 @@
+"""USD materials: UsdPreviewSurface networks, and MaterialX standard_surface files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from appearance_opt.asset import images
+from appearance_opt.asset.materialx import load_materialx
+from appearance_opt.asset.packing import pack_orm
+from appearance_opt.asset.paths import resolve
+from appearance_opt.asset.types import Material, Texture
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from numpy.typing import NDArray
+
+_WRAPS = {"repeat": "repeat", "clamp": "clamp", "mirror": "mirror", "black": "clamp"}
+_CHANNEL = {"r": 0, "g": 1, "b": 2, "a": 3}
+
+
+class MaterialReader:
+    """Materials of a stage, each read once."""
+
+    def __init__(self, stage: Any, path: Path, notes: list[str]) -> None:
+        self.stage, self.path, self.notes = stage, path, notes
+        self._materials: dict[str, Material] = {}
+        self._pixels: dict[str, NDArray] = {}
+
+    def bindings(self, prim: Any, mesh: Any, face_ids: NDArray) -> Iterator[tuple[Material, NDArray[np.bool_]]]:
+        """(material, mask of the triangles that wear it); ``face_ids``: face of the file of each triangle."""
+        from pxr import UsdGeom, UsdShade
+
+        rest = np.ones(len(face_ids), bool)
+        api = UsdShade.MaterialBindingAPI(prim)
+        for subset in api.GetMaterialBindSubsets():
+            faces = np.array(UsdGeom.Subset(subset).GetIndicesAttr().Get() or [], np.int64)
+            mask = np.isin(face_ids, faces) & rest
+            rest &= ~mask
+            yield self._bound(subset.GetPrim()), mask
+        if rest.any():
+            yield self._bound(prim), rest
+
+    def uv_name(self, prim: Any) -> str:
+        """The primvar that holds texture coordinates: what the material reads, or the usual names."""
+        from pxr import UsdGeom, UsdShade
+
+        names = []
+        material = self._bound_prim(prim)
+        if material:
+            for node in _descendants(material.GetPrim()):
+                shader = UsdShade.Shader(node)
+                if shader and str(shader.GetIdAttr().Get() or "").startswith("UsdPrimvarReader_float2"):
+                    names.append(str(_value(shader.GetInput("varname")) or ""))
+        api = UsdGeom.PrimvarsAPI(prim)
+        for name in [*names, "st", "UVMap", "map1", "uv"]:
+            if name and api.HasPrimvar(name):
+                return name
+        return "st"
+
+    def uses_display_color(self, prim: Any) -> bool:
+        """Is displayColor what colours the mesh? (No material, or one that reads it.)"""
+        from pxr import UsdShade
+
+        material = self._bound_prim(prim)
+        if not material:
+            return not self._unresolved(prim)
+        readers = (UsdShade.Shader(n) for n in _descendants(material.GetPrim()))
+        return any(r and str(_value(r.GetInput("varname"))) == "displayColor" for r in readers)
+
+    def _bound_prim(self, prim: Any) -> Any:
+        from pxr import UsdShade
+
+        return UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()[0]
+
+    def _unresolved(self, prim: Any) -> str | None:
+        """Name of a bound material that does not exist on the stage."""
+        from pxr import UsdShade
+
+        targets = UsdShade.MaterialBindingAPI(prim).GetDirectBindingRel().GetTargets()
+        return targets[0].name if targets and not self.stage.GetPrimAtPath(targets[0]) else None
+
+    def _bound(self, prim: Any) -> Material:
+        material = self._bound_prim(prim)
+        if material:
+            key = str(material.GetPath())
+            if key not in self._materials:
+                self._materials[key] = self._read(material)
+            return self._materials[key]
+        name = self._unresolved(prim)
+        if name is not None:
+            if name not in self._materials:
+                self._materials[name] = self._from_materialx(name)
+            return self._materials[name]
+        return self._materials.setdefault("", Material(name="default", base_color=(1.0, 1.0, 1.0), roughness=0.5))
+
+    def _from_materialx(self, name: str) -> Material:
+        """A material that usd-core could not compose because it lives in a MaterialX file."""
+        root = self.path.resolve().parent
+        for layer in self.stage.GetUsedLayers():
+            for dependency in layer.GetCompositionAssetDependencies():
+                if not dependency.endswith(".mtlx") or not layer.realPath:
+                    continue
+                file = resolve(str((Path(layer.realPath).parent / dependency).relative_to(root)), self.path)
+                found = load_materialx(file, name)
+                if found is not None:
+                    self.notes.append(f"material '{name}' read from {file.name}: subsurface and coat ignored")
+                    return found
+        self.notes.append(f"material '{name}' does not exist: default material used")
+        return Material(name=name)
+
+    def _read(self, material: Any) -> Material:
+        from pxr import UsdShade
+
+        name = str(material.GetPrim().GetName())
+        shader = material.ComputeSurfaceSource()[0]
+        if not shader or str(shader.GetIdAttr().Get()) != "UsdPreviewSurface":
+            self.notes.append(f"material '{name}' has no UsdPreviewSurface: default material used")
+            return Material(name=name)
+
+        def of(key: str, default: Any) -> tuple[Any, Any, str]:
+            """(constant, texture shader or None, its output) of an input."""
+            source = shader.GetInput(key)
+            if source and source.HasConnectedSource():
+                attributes = UsdShade.Utils.GetValueProducingAttributes(source)
+                if attributes and UsdShade.Utils.GetType(attributes[0].GetName()) == UsdShade.AttributeType.Output:
+                    node = UsdShade.Shader(attributes[0].GetPrim())
+                    output = UsdShade.Output(attributes[0]).GetBaseName()
+                    if str(node.GetIdAttr().Get()) == "UsdUVTexture":
+                        return default, node, output
+                    # a primvar reader: the mesh's vertex colours take its place
+                    return ((1.0, 1.0, 1.0) if key == "diffuseColor" else default), None, ""
+            value = _value(source)
+            return (default if value is None else value), None, ""
+
+        color, color_map, _ = of("diffuseColor", (0.18, 0.18, 0.18))
+        roughness, rough_map, rough_channel = of("roughness", 0.5)
+        metalness, metal_map, metal_channel = of("metallic", 0.0)
+        _, normal_map, _ = of("normal", None)
+        opacity, _, _ = of("opacity", 1.0)
+        if float(opacity) < 1:
+            self.notes.append(f"material '{name}': transparency ignored, drawn opaque")
+        rough = self._texture(rough_map, "linear", rough_channel) if rough_map else None
+        metal = self._texture(metal_map, "linear", metal_channel) if metal_map else None
+        r, g, b = (1.0, 1.0, 1.0) if color_map else (float(x) for x in color)
+        return Material(
+            name=name,
+            base_color=(r, g, b),
+            roughness=1.0 if rough else float(roughness),
+            metalness=1.0 if metal else float(metalness),
+            base_color_texture=self._texture(color_map, "srgb") if color_map else None,
+            orm_texture=pack_orm(rough, metal) if rough or metal else None,
+            normal_texture=self._texture(normal_map, "linear") if normal_map else None,
+            opacity=float(opacity),
+        )
+
+    def _texture(self, node: Any, space: str, channel: str = "rgb") -> Texture:
+        asset = _value(node.GetInput("file"))
+        text = asset.resolvedPath or asset.path if asset is not None else ""
+        pixels = self._image(text)
+        encoding = str(_value(node.GetInput("sourceColorSpace")) or "auto")
+        if encoding == "raw":
+            space = "linear"
+        elif encoding == "sRGB":
+            space = "srgb"
+        if channel in _CHANNEL and channel != "rgb":
+            pixels = pixels[..., min(_CHANNEL[channel], pixels.shape[2] - 1)][..., None]
+        elif pixels.shape[2] < 3:
+            pixels = np.repeat(pixels[..., :1], 3, axis=2)
+        wraps = tuple(_WRAPS.get(str(_value(node.GetInput(k))), "repeat") for k in ("wrapS", "wrapT"))
+        return Texture(np.ascontiguousarray(pixels), space, wraps)  # type: ignore[arg-type]
+
+    def _image(self, text: str) -> NDArray:
+        if text not in self._pixels:
+            if "[" in text:  # inside a .usdz package
+                from pxr import Ar
+
+                opened = Ar.GetResolver().OpenAsset(Ar.ResolvedPath(text))
+                data = bytes(opened.GetBuffer()) if opened else b""
+                self._pixels[text] = images.decode(data, text)
+            else:
+                root = self.path.resolve().parent
+                path = Path(text)
+                inside = path.is_absolute() and path.resolve().is_relative_to(root)
+                reference = str(path.resolve().relative_to(root)) if inside else text
+                self._pixels[text] = images.read(resolve(reference, self.path))
+        return self._pixels[text]
+
+
+def _descendants(prim: Any) -> Any:
+    from pxr import Usd
+
+    return Usd.PrimRange(prim)
+
+
+def _value(source: Any) -> Any:
+    """Value of an input, through the interfaces of node graphs."""
+    from pxr import UsdShade
+
+    if not source:
+        return None
+    attributes = UsdShade.Utils.GetValueProducingAttributes(source)
+    return attributes[0].Get() if attributes else None

@@ -1,0 +1,215 @@
+"""USD stages to an Asset: composition, transforms, subsets, primvars, subdivision."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from appearance_opt.asset.paths import read_bytes
+from appearance_opt.asset.subdivide import Polygons, catmull_clark, triangulate
+from appearance_opt.asset.types import Asset, Mesh
+from appearance_opt.asset.usd_materials import MaterialReader
+from appearance_opt.errors import InputError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+_TO_Y_UP = {
+    "Y": np.eye(3),
+    "Z": np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]),
+    "X": np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]),
+}
+
+
+def load_usd(path: Path, subdivision: int = 1, variants: dict[str, str] | None = None) -> Asset:
+    """Read a stage at its default time, variants at their selection (or as ``variants`` says: set name ->
+    variant, on the default prim). Catmull-Clark and Loop meshes are refined ``subdivision`` times. Raises
+    InputError."""
+    from pxr import Tf, Usd
+
+    path = Path(path)
+    read_bytes(path)
+    try:
+        stage = Usd.Stage.Open(str(path))
+    except Tf.ErrorException as error:
+        raise InputError(f"{path}: not a readable USD file ({_first_line(error)})") from None
+    if stage is None:
+        raise InputError(f"{path}: not a readable USD file")
+    _select(stage, variants or {}, path)
+    _refuse_escapes(stage, path)
+    return _Reader(stage, path, subdivision).asset()
+
+
+def _select(stage: Any, variants: dict[str, str], path: Path) -> None:
+    prim = stage.GetDefaultPrim()
+    stage.SetEditTarget(stage.GetSessionLayer())
+    for name, choice in variants.items():
+        sets = prim.GetVariantSets() if prim else None
+        if sets is None or not sets.HasVariantSet(name) or choice not in sets.GetVariantSet(name).GetVariantNames():
+            have = {n: sets.GetVariantSet(n).GetVariantNames() for n in sets.GetNames()} if sets else {}
+            raise InputError(f"{path}: has no variant {name}={choice}; there are {have or 'none'}")
+        sets.GetVariantSet(name).SetVariantSelection(choice)
+
+
+def _refuse_escapes(stage: Any, path: Path) -> None:
+    """Layers outside the folder of the root layer are not read on behalf of it."""
+    root = path.resolve().parent
+    for layer in stage.GetUsedLayers():
+        if layer.anonymous or not layer.realPath:
+            continue
+        real = layer.realPath.split("[")[0]
+        if not Path(real).resolve().is_relative_to(root):
+            raise InputError(f"{path}: refers to '{layer.identifier}' outside its own folder; copy it beside the file")
+
+
+class _Reader:
+    def __init__(self, stage: Any, path: Path, subdivision: int) -> None:
+        from pxr import UsdGeom
+
+        self.stage, self.path, self.subdivision = stage, path, subdivision
+        self.notes: list[str] = []
+        self.up = str(UsdGeom.GetStageUpAxis(stage))
+        self.unit = float(UsdGeom.GetStageMetersPerUnit(stage))
+        self.to_metres = _TO_Y_UP[self.up] * self.unit
+        self.materials = MaterialReader(stage, path, self.notes)
+        self.cache = UsdGeom.XformCache()
+
+    def asset(self) -> Asset:
+        from pxr import Usd, UsdGeom
+
+        meshes: list[Mesh] = []
+        for prim in Usd.PrimRange.Stage(self.stage, Usd.TraverseInstanceProxies()):
+            if not prim.IsA(UsdGeom.Mesh):
+                if prim.IsA(UsdGeom.Gprim):
+                    self._note(f"{prim.GetTypeName()} '{prim.GetPath()}' ignored: only meshes are read")
+                continue
+            imageable = UsdGeom.Imageable(prim)
+            hidden = imageable.ComputeVisibility() == UsdGeom.Tokens.invisible
+            if hidden or imageable.ComputePurpose() in (UsdGeom.Tokens.guide, UsdGeom.Tokens.proxy):
+                self._note(f"'{prim.GetPath()}' ignored: hidden, guide or proxy geometry")
+                continue
+            meshes += self._mesh(prim)
+        return Asset(tuple(meshes), self.path.stem, tuple(self.notes), self.up, self.unit)  # type: ignore[arg-type]
+
+    def _note(self, text: str) -> None:
+        if text not in self.notes:
+            self.notes.append(text)
+
+    def _mesh(self, prim: Any) -> list[Mesh]:
+        from pxr import UsdGeom
+
+        mesh = UsdGeom.Mesh(prim)
+        points = np.array(mesh.GetPointsAttr().Get() or [], np.float64).reshape(-1, 3)
+        counts = np.array(mesh.GetFaceVertexCountsAttr().Get() or [], np.int64)
+        indices = np.array(mesh.GetFaceVertexIndicesAttr().Get() or [], np.int64)
+        if counts.sum() != len(indices) or (counts < 0).any():
+            raise InputError(f"{self.path}, mesh '{prim.GetPath()}': its face counts do not match its indices")
+        if len(indices) and (indices.min() < 0 or indices.max() >= len(points)):
+            raise InputError(f"{self.path}, mesh '{prim.GetPath()}': faces refer to points that do not exist")
+        polygons = Polygons(counts, indices)
+        face_ids = np.arange(len(counts))
+        values = {"points": (points, polygons)}
+        for name, (value, where) in self._primvars(prim, mesh, polygons).items():
+            values[name] = (value, where)
+        scheme = str(mesh.GetSubdivisionSchemeAttr().Get())
+        if scheme in ("catmullClark", "loop") and self.subdivision > 0:
+            values.pop("normals", None)
+            if scheme == "loop":
+                self._note("Loop subdivision surfaces are refined by the rules of Catmull-Clark")
+            for _ in range(self.subdivision):
+                face_ids = np.repeat(face_ids, values["points"][1].counts)
+                values = {n: catmull_clark(v, p, n == "uvs") for n, (v, p) in values.items()}
+        flipped = str(mesh.GetOrientationAttr().Get()) == "leftHanded"
+        return self._split(prim, values, face_ids, flipped)
+
+    def _primvars(self, prim: Any, mesh: Any, polygons: Polygons) -> dict[str, tuple[NDArray, Polygons]]:
+        """Normals, texture coordinates and colours, each as values and faces of its own."""
+        from pxr import UsdGeom
+
+        api = UsdGeom.PrimvarsAPI(prim)
+        out: dict[str, tuple[NDArray, Polygons]] = {}
+        uv = api.GetPrimvar(self.materials.uv_name(prim))
+        if uv and uv.HasValue():
+            found = _expand(uv.ComputeFlattened(), uv.GetInterpolation(), polygons, 2)
+            if found is not None:
+                out["uvs"] = (np.stack([found[0][:, 0], 1 - found[0][:, 1]], axis=1), found[1])
+        color = api.GetPrimvar("displayColor")
+        if color and color.HasValue() and self.materials.uses_display_color(prim):
+            found = _expand(color.ComputeFlattened(), color.GetInterpolation(), polygons, 3)
+            if found is not None:
+                out["colors"] = found
+        normals = api.GetPrimvar("normals")
+        value, how = None, ""
+        if normals and normals.HasValue():
+            value, how = normals.ComputeFlattened(), normals.GetInterpolation()
+        elif mesh.GetNormalsAttr().HasValue():
+            value, how = mesh.GetNormalsAttr().Get(), mesh.GetNormalsInterpolation()
+        found = _expand(value, how, polygons, 3) if value is not None else None
+        if found is not None:
+            out["normals"] = found
+        return out
+
+    def _split(self, prim: Any, values: dict, face_ids: NDArray, flipped: bool) -> list[Mesh]:
+        """Triangles with one index for all attributes, one mesh per material."""
+        from pxr import Gf, UsdGeom
+
+        corners, face = triangulate(values["points"][1])
+        if flipped:
+            corners = corners[:, ::-1]
+        matrix = np.array(Gf.Matrix4d(self.cache.GetLocalToWorldTransform(prim)))
+        linear = matrix[:3, :3] @ self.to_metres.T
+        offset = matrix[3, :3] @ self.to_metres.T
+        if np.linalg.det(linear) < 0:
+            corners = corners[:, ::-1]
+        cofactor = np.linalg.inv(linear).T if abs(np.linalg.det(linear)) > 0 else np.eye(3)
+        names = list(values)
+        meshes = []
+        for material, chosen in self.materials.bindings(prim, UsdGeom.Mesh(prim), face_ids[face]):
+            rows = np.stack([values[n][1].indices[corners[chosen]].ravel() for n in names], axis=1)
+            if not len(rows):
+                continue
+            used, index = np.unique(rows, axis=0, return_inverse=True)
+            got = {n: values[n][0][used[:, k]] for k, n in enumerate(names)}
+            normals = got.get("normals")
+            if normals is not None:
+                normals = normals @ cofactor
+                normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
+            meshes.append(
+                Mesh(
+                    positions=(got["points"] @ linear + offset).astype(np.float32),
+                    faces=index.reshape(-1, 3).astype(np.int32),
+                    normals=None if normals is None else normals.astype(np.float32),
+                    uvs=got["uvs"].astype(np.float32) if "uvs" in got else None,
+                    colors=got["colors"].astype(np.float32) if "colors" in got else None,
+                    material=material,
+                    name=str(prim.GetName()),
+                )
+            )
+        return meshes
+
+
+def _expand(value: Any, how: str, polygons: Polygons, width: int) -> tuple[NDArray, Polygons] | None:
+    """A primvar as (values (N, width), faces into them); None when its size does not fit its
+    interpolation."""
+    v = np.array(value, np.float64).reshape(-1, width)
+    corners = len(polygons.indices)
+    if how in ("vertex", "varying") and len(v) > polygons.indices.max(initial=-1):
+        return v, polygons
+    if how == "constant" and len(v):
+        return v[:1], Polygons(polygons.counts, np.zeros(corners, np.int64))
+    if how == "uniform" and len(v) == len(polygons.counts):
+        return v, Polygons(polygons.counts, np.repeat(np.arange(len(v)), polygons.counts))
+    if how == "faceVarying" and len(v) == corners:
+        # corners of one point with one value are one vertex: seams are where values differ
+        rows = np.concatenate([polygons.indices[:, None].astype(np.float64), v], axis=1)
+        unique, index = np.unique(rows, axis=0, return_inverse=True)
+        return unique[:, 1:], Polygons(polygons.counts, index.ravel())
+    return None
+
+
+def _first_line(error: Exception) -> str:
+    return " ".join(str(error).split())[:120]
+
+
