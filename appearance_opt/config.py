@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import re
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -31,13 +32,13 @@ chosen."""
 class SimplifyOptions:
     """How to simplify.
 
-    ``triangles`` or ``ratio``: the budget (exactly one). ``texture_size``: texels per side of the
-    new maps, a power of two. ``resolution``, ``views``: pixels per side and views of a step. ``steps``,
-    ``budget`` (seconds for the whole job, set-up and report included): when to stop; whichever comes first.
-    ``pool``: number of reference views rendered (each is used many times). ``fit``: what moves.
-    ``init``: "decimate", "sphere", or a file with a start. ``relative``: the Laplacian keeps the start's shape
-    (a sphere start uses the absolute one unless told otherwise). ``*_rate``: learning rates; positions in
-    units of the local edge length. ``keep_hidden``: keep geometry that no outside view sees.
+    ``triangles`` or ``ratio``: the budget (exactly one). ``texture_size``: texels per side of the new maps, a
+    power of two. ``resolution``, ``views``: pixels per side and views of a step. ``steps``, ``budget`` (seconds
+    for the whole job, set-up and report included): when to stop; whichever comes first. ``pool``: number of
+    reference views rendered (each is used many times). ``fit``: what moves. ``init``: "decimate", "sphere", or a
+    file with a start. ``relative``: the Laplacian keeps the start's shape (a sphere start uses the absolute one
+    unless told otherwise). ``*_rate``: learning rates, positions in units of the local edge length; by default
+    they follow from how good the start is. ``keep_hidden``: keep geometry that no outside view sees.
     ``subdivision``: level for USD subdivision surfaces. Raises InputError for values that make no sense.
     """
 
@@ -54,10 +55,10 @@ class SimplifyOptions:
     loss: str = "log-srgb-l1"
     laplacian: float = 0.25
     relative: bool | None = None
-    position_rate: float = 0.005
-    normal_rate: float = 0.005
-    color_rate: float = 0.004
-    material_rate: float = 0.004
+    position_rate: float | None = None
+    normal_rate: float | None = None
+    color_rate: float | None = None
+    material_rate: float | None = None
     background: str = "random"
     light: str = "point"
     seed: int = 0
@@ -82,7 +83,8 @@ class SimplifyOptions:
         _require(0 <= self.subdivision <= 5, "subdivision", self.subdivision, "from 0 to 5")
         _require(self.laplacian >= 0, "laplacian", self.laplacian, "0 or more")
         for name in ("position_rate", "normal_rate", "color_rate", "material_rate"):
-            _require(0 <= getattr(self, name) <= 1, name.replace("_", "-"), getattr(self, name), "from 0 to 1")
+            rate = getattr(self, name)
+            _require(rate is None or 0 <= rate <= 1, name.replace("_", "-"), rate, "from 0 to 1")
         for part in self.fit:
             _choice("fit", part, FIT_PARTS)
         _choice("loss", self.loss, LOSS_NAMES)
@@ -105,13 +107,15 @@ class SimplifyOptions:
         return (r, g, b)
 
 
+OPTION_NAMES = frozenset(f.name for f in fields(SimplifyOptions))
+
+
 def simplify_options(preset: str = "default", **values: Any) -> SimplifyOptions:
     """Options from a preset and what overrides it. Raises InputError for unknown names and bad values."""
     _choice("preset", preset, tuple(PRESETS))
-    known = {f.name for f in fields(SimplifyOptions)}
     for name in values:
-        if name not in known:
-            raise InputError(_unknown(name, known))
+        if name not in OPTION_NAMES:
+            raise InputError(_unknown(name, OPTION_NAMES))
     merged = {**PRESETS[preset], **values}
     # an explicit number of steps replaces the preset's time budget
     if values.get("steps") is not None and "budget" not in values:
@@ -121,9 +125,9 @@ def simplify_options(preset: str = "default", **values: Any) -> SimplifyOptions:
 
 def read_toml(path: Path) -> dict[str, Any]:
     """Keys of a job file, dashes or underscores. Raises InputError for unknown keys, suggesting the nearest."""
-    try:
+    if sys.version_info >= (3, 11):
         import tomllib
-    except ModuleNotFoundError:  # Python 3.10
+    else:
         import tomli as tomllib
     try:
         data = tomllib.loads(Path(path).read_text(encoding="utf-8"))
@@ -131,7 +135,7 @@ def read_toml(path: Path) -> dict[str, Any]:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from error
     except (ValueError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: not a valid TOML file ({error})") from error
-    known = {f.name for f in fields(SimplifyOptions)} | {"preset"}
+    known = OPTION_NAMES | {"preset"}
     out: dict[str, Any] = {}
     for key, value in data.items():
         name = key.replace("-", "_")
@@ -189,7 +193,7 @@ def _choice(name: str, value: str, allowed: tuple[str, ...]) -> None:
         raise InputError(f"--{name} {value}: choose from {', '.join(allowed)}{hint}")
 
 
-def _unknown(name: str, known: set[str]) -> str:
+def _unknown(name: str, known: frozenset[str]) -> str:
     close = difflib.get_close_matches(name.replace("-", "_"), sorted(known), 1, 0.4)
     hint = f"; did you mean '{close[0].replace('_', '-')}'?" if close else ""
     return f"unknown key '{name}'{hint}"

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 if TYPE_CHECKING:
     import mitsuba as mi
     from numpy.typing import NDArray
-
-LightMode = Literal["point", "headlight"]
 
 RECORD = 16
 """Floats per view on the device: eye, forward, right, down (each xyz + one light component)."""
@@ -52,7 +50,10 @@ class Views:
 
         packed = np.concatenate(
             [
-                *(np.concatenate([v, self.light[:, k : k + 1]], 1) for k, v in enumerate((self.eye, self.forward, self.right))),
+                *(
+                    np.concatenate([v, self.light[:, k : k + 1]], 1)
+                    for k, v in enumerate((self.eye, self.forward, self.right))
+                ),
                 np.concatenate([self.down, self.intensity[:, None]], 1),
             ],
             axis=1,
@@ -105,7 +106,7 @@ class ViewSampler:
     stream: int = 0
     fov: float = 32.0
     hull: NDArray | None = None
-    light: LightMode = "point"
+    light: str = "point"
     light_spread: float = 75.0
     exposure: float = 0.85
 

@@ -36,7 +36,9 @@ class Document:
         if not isinstance(self.json, dict) or "asset" not in self.json:
             raise InputError(f"{path}: not a glTF file (no 'asset' object)")
         if not str(self.json["asset"].get("version", "")).startswith("2"):
-            raise InputError(f"{path}: glTF version {self.json['asset'].get('version')} is not supported; convert to 2.0")
+            raise InputError(
+                f"{path}: glTF version {self.json['asset'].get('version')} is not supported; convert to 2.0"
+            )
         self._buffers: dict[int, bytes] = {}
 
     def items(self, kind: str) -> list[dict[str, Any]]:
@@ -79,7 +81,7 @@ class Document:
                 s["values"]["bufferView"], s["values"].get("byteOffset", 0), kind, width, s["count"]
             )
         if a.get("normalized") and kind.kind != "f":
-            return np.maximum(out.astype(np.float32) / np.float32(np.iinfo(kind).max), -1)
+            return np.maximum(out.astype(np.float32) / np.float32(np.iinfo(kind.type).max), -1)
         return out
 
     def _elements(self, view: int, offset: int, kind: np.dtype, width: int, count: int) -> NDArray:

@@ -145,7 +145,8 @@ class _Reader:
         """(material, index of the texture coordinates that its textures use)."""
         infos = self._texture_infos(index)
         channels = [
-            i.get("extensions", {}).get("KHR_texture_transform", {}).get("texCoord", i.get("texCoord", 0)) for i in infos
+            i.get("extensions", {}).get("KHR_texture_transform", {}).get("texCoord", i.get("texCoord", 0))
+            for i in infos
         ]
         if len(set(channels)) > 1:
             self._note("textures of one material use different texture coordinates: the first set is used for all")
@@ -192,7 +193,7 @@ class _Reader:
         if source not in self._images:
             self._images[source] = self._image(source, material)
         sampler = self.document.items("samplers")[texture["sampler"]] if "sampler" in texture else {}
-        wrap = (_WRAPS.get(sampler.get("wrapS"), "repeat"), _WRAPS.get(sampler.get("wrapT"), "repeat"))
+        wrap = (_WRAPS.get(sampler.get("wrapS", 0), "repeat"), _WRAPS.get(sampler.get("wrapT", 0), "repeat"))
         pixels = self._images[source]
         if pixels.shape[2] < 3:  # grey, or grey and alpha
             pixels = np.repeat(pixels[..., :1], 3, axis=2)

@@ -50,7 +50,7 @@ def _open(path: Path, name: str) -> NDArray:
         source.close()
 
 
-def _read(source, name: str) -> NDArray:  # noqa: ANN001 - an OpenImageIO.ImageInput
+def _read(source, name: str) -> NDArray:
     import OpenImageIO as oiio
 
     spec = source.spec()

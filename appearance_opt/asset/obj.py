@@ -96,7 +96,9 @@ class _Parser:
         used, faces = np.unique(np.array(corners, np.int64), axis=0, return_inverse=True)
         for k, (what, rows) in enumerate((("position", self.positions), ("uv", self.uvs), ("normal", self.normals))):
             if used[:, k].max() >= len(rows) and used[:, k].max() >= 0:
-                raise InputError(f"{self.path}: a face refers to {what} {used[:, k].max() + 1}, but there are {len(rows)}")
+                raise InputError(
+                    f"{self.path}: a face refers to {what} {used[:, k].max() + 1}, but there are {len(rows)}"
+                )
         vertices = [self.positions[i] for i in used[:, 0]]
         if any(len(v) < 3 for v in vertices):
             raise InputError(f"{self.path}: a vertex has fewer than three coordinates")

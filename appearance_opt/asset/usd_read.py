@@ -211,5 +211,3 @@ def _expand(value: Any, how: str, polygons: Polygons, width: int) -> tuple[NDArr
 
 def _first_line(error: Exception) -> str:
     return " ".join(str(error).split())[:120]
-
-

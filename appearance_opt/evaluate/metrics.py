@@ -52,7 +52,8 @@ def compare_images(reference: NDArray, candidate: NDArray) -> Metrics:
         raise ValueError(f"images differ in shape: {reference.shape} and {candidate.shape}")
     views = tuple(_view(r, c) for r, c in zip(reference, candidate, strict=True))
     names = ("psnr", "psnr_covered", "flip", "silhouette_iou", "silhouette_shift")
-    return Metrics(*(float(np.mean([getattr(v, n) for v in views])) for n in names), views)
+    means = {n: float(np.mean([getattr(v, n) for v in views])) for n in names}
+    return Metrics(**means, views=views)
 
 
 def _view(reference: NDArray, candidate: NDArray) -> ViewMetrics:

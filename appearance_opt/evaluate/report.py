@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from appearance_opt.asset.images import encode_png
-from appearance_opt.evaluate.template import PAGE, SLIDER_SCRIPT, STYLE
 from appearance_opt.evaluate.metrics import Metrics
+from appearance_opt.evaluate.template import PAGE, SLIDER_SCRIPT, STYLE
 
 if TYPE_CHECKING:
     import numpy as np
@@ -122,7 +122,9 @@ def curve_svg(curve: list[tuple[float, int, float, float]], width: int = 720, he
         x = xs[-1] * k / 4
         px, _ = at(x, low)
         marks.append(f'<text x="{px:.1f}" y="{height - 12}" text-anchor="middle">{x:.0f} s</text>')
-    dots = "".join(f'<circle cx="{a:.1f}" cy="{b:.1f}" r="3"/>' for a, b in (at(x, y) for x, y in zip(xs, ys, strict=True)))
+    dots = "".join(
+        f'<circle cx="{a:.1f}" cy="{b:.1f}" r="3"/>' for a, b in (at(x, y) for x, y in zip(xs, ys, strict=True))
+    )
     return (
         f'<svg viewBox="0 0 {width} {height}" role="img" aria-label="PSNR in dB against seconds">'
         f'{"".join(marks)}<polyline points="{points}"/>{dots}</svg>'
@@ -130,11 +132,12 @@ def curve_svg(curve: list[tuple[float, int, float, float]], width: int = 720, he
 
 
 def _view_block(index: int, view: dict[str, Any], source: Any) -> str:
+    before, after = (source(f"view{index}_{n}.png") for n in ("reference", "result"))
     slider = (
-        '<div class="slider"><img src="{0}" alt="reference"><div class="after"><img src="{1}" alt="result"></div>'
-        '<input type="range" min="0" max="100" value="50" aria-label="reference or result"><span class="l">reference'
-        '</span><span class="r">result</span></div>'
-    ).format(*(source(f"view{index}_{n}.png") for n in ("reference", "result")))
+        f'<div class="slider"><img src="{before}" alt="reference"><div class="after"><img src="{after}" alt="result">'
+        '</div><input type="range" min="0" max="100" value="50" aria-label="reference or result">'
+        '<span class="l">reference</span><span class="r">result</span></div>'
+    )
     others = "".join(
         f'<figure><img src="{source(f"view{index}_{_slug(n)}.png")}" alt="{html.escape(n)}"><figcaption>'
         f"{html.escape(n)}</figcaption></figure>"
@@ -154,7 +157,9 @@ def _metrics_table(metrics: dict[str, Metrics]) -> str:
     )
     head = "".join(f"<th>{html.escape(n)}</th>" for n in metrics)
     body = "".join(
-        f"<tr><td>{label}</td>" + "".join(f"<td>{form.format(getattr(m, key))}</td>" for m in metrics.values()) + "</tr>"
+        f"<tr><td>{label}</td>"
+        + "".join(f"<td>{form.format(getattr(m, key))}</td>" for m in metrics.values())
+        + "</tr>"
         for label, key, form in rows
     )
     return f"<table class='metrics'><tr><th></th>{head}</tr>{body}</table>"

@@ -74,7 +74,7 @@ class Checkpointer:
                 arrays[f"best/{name}"] = np.array(state.best[name])
         with tempfile.NamedTemporaryFile(dir=self.path.parent, suffix=".tmp", delete=False) as file:
             try:
-                np.savez(file, **arrays)
+                np.savez(file, allow_pickle=False, **arrays)
                 file.flush()
                 os.replace(file.name, self.path)
             except BaseException:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Literal, Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
@@ -30,7 +30,8 @@ log = logging.getLogger(__name__)
 MAX_BAD_STEPS = 10
 """Consecutive steps with non-finite gradients after which a fit gives up."""
 
-Background = Literal["random", "black", "white", "grey"] | tuple[float, float, float]
+Background = str | tuple[float, float, float]
+"""random, black, white, grey, or linear RGB."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +48,7 @@ class FitOptions:
     relative: bool = True
     decay: float = 1.5
     background: Background = "random"
-    quality: Quality = Quality()
+    quality: Quality = field(default_factory=Quality)
     validate_every: float = 0.1
     seed: int = 0
 
@@ -94,7 +95,8 @@ def fit(
     state)."""
     run = _Run(model, pool, validation, options, progress, checkpointer)
     try:
-        run.look()
+        if run.state.best is None:
+            run.look()
         while not run.clock.done(run.state.iteration):
             run.advance()
     except KeyboardInterrupt:
@@ -216,7 +218,9 @@ class _Run:
         seconds = self.clock.time()
         fraction = self.clock.progress(state.iteration)
         left = seconds * (1 - fraction) / fraction if fraction > 0 else None
-        self.progress.update(state.iteration, fraction, state.loss, self.psnr, state.iteration / max(seconds, 1e-9), left)
+        self.progress.update(
+            state.iteration, fraction, state.loss, self.psnr, state.iteration / max(seconds, 1e-9), left
+        )
 
 
 def backgrounds(background: Background, count: int, seed: int, iteration: int) -> NDArray[np.float32]:

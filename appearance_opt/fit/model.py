@@ -51,7 +51,9 @@ class Model:
     are not fitted are kept in a layer of their own, without gradients or moments.
     """
 
-    def __init__(self, mesh: LatentMesh, maps: Mapping[str, NDArray | float], fit: frozenset[str], rates: Rates) -> None:
+    def __init__(
+        self, mesh: LatentMesh, maps: Mapping[str, NDArray | float], fit: frozenset[str], rates: Rates
+    ) -> None:
         images = {n: np.asarray(maps[n]) for n in CHANNELS if n in maps and np.ndim(maps[n])}
         self.constants = {n: float(v) for n, v in maps.items() if not np.ndim(v)}
         fitted = tuple(n for n in images if _group(n) in fit)
@@ -62,8 +64,7 @@ class Model:
         self._fixed_positions = mi.Float(np.ascontiguousarray(mesh.positions, np.float32).ravel())
         self.parameters: dict[str, Parameter] = {}
         if "shape" in fit:
-            rate = np.repeat(self.edge_length * rates.position, 3).astype(np.float32)
-            self.parameters[POSITIONS] = Parameter(POSITIONS, mi.Float(self._fixed_positions), 1, mi.Float(rate))
+            self.parameters[POSITIONS] = Parameter(POSITIONS, mi.Float(self._fixed_positions), 1, mi.Float(0))
         self.codec: TexelCodec | None = None
         if fitted:
             codec = TexelCodec(fitted, len(images[fitted[0]]))
@@ -72,7 +73,7 @@ class Model:
                 TEXELS,
                 codec.encode(images),
                 codec.packed,
-                codec.per_channel({n: rates.of_channel(n) for n in fitted}),
+                mi.Float(0),
                 codec.per_channel({n: BOUNDS[n][0] for n in fitted}),
                 codec.per_channel({n: BOUNDS[n][1] for n in fitted}),
             )
@@ -83,6 +84,16 @@ class Model:
             names = tuple(self._fixed_maps)
             fixed = TexelCodec(names, len(self._fixed_maps[names[0]]))
             self._fixed_layers = (fixed.layer(fixed.encode(self._fixed_maps)),)
+        self.set_rates(rates)
+
+    def set_rates(self, rates: Rates) -> None:
+        """Change the learning rates of all parameters."""
+        if POSITIONS in self.parameters:
+            per_vertex = np.repeat(self.edge_length * rates.position, 3).astype(np.float32)
+            self.parameters[POSITIONS].rate = mi.Float(per_vertex)
+        if self.codec is not None:
+            per_channel = {n: rates.of_channel(n) for n in self.codec.channels}
+            self.parameters[TEXELS].rate = self.codec.per_channel(per_channel)
 
     def positions(self) -> mi.Float:
         """Current flat positions (3 V)."""

@@ -179,7 +179,9 @@ def _legal(state: _State, edges: NDArray, target: NDArray, uses: NDArray, strict
     return legal
 
 
-def _link_condition(faces: NDArray, which: NDArray, inside: NDArray, edges: NDArray, uses: NDArray) -> NDArray[np.bool_]:
+def _link_condition(
+    faces: NDArray, which: NDArray, inside: NDArray, edges: NDArray, uses: NDArray
+) -> NDArray[np.bool_]:
     """(N,) edges whose ends have exactly as many common neighbours as the edge has faces."""
     kept = inside == 1
     f, w = faces[kept], which[kept]

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
     from appearance_opt.asset.types import Asset
     from appearance_opt.evaluate.metrics import Metrics
-    from appearance_opt.views import ViewSampler, Views
+    from appearance_opt.views import Views, ViewSampler
 
 HELD_OUT_STREAM = 3
 """Stream of random views that no fit draws from."""

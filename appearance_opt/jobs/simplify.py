@@ -22,13 +22,19 @@ if TYPE_CHECKING:
 
     from appearance_opt.asset.types import Asset
     from appearance_opt.fit.loop import FitResult, Progress
-    from appearance_opt.reference.mesh import MeshReference
-    from appearance_opt.views import ViewSampler
+    from appearance_opt.fit.model import Rates
+    from appearance_opt.render.gradient import Quality
 
 log = logging.getLogger(__name__)
 
 VALIDATION_VIEWS = 8
 CHECKPOINT_SECONDS = 10.0
+
+POOL_SAMPLES = 9
+"""Rays per pixel of the reference's images."""
+
+GOOD_START = 28.0
+"""Held-out PSNR (dB) of a start from which on every pixel is worth four samples."""
 
 EXPORT_SECONDS = 1.0
 """Time kept back from the budget for writing the result; the report has a reserve of its own."""
@@ -87,10 +93,8 @@ def simplify(
     """
     watch = Stopwatch()
     if out is not None:
-        check_writable(Path(out))
-        if not isinstance(source, _asset_type()) and Path(out).resolve() == Path(source).resolve():
-            raise InputError(f"{out}: is the input itself, which is never changed; choose another name")
-    asset = source if isinstance(source, _asset_type()) else load(source, subdivision=options.subdivision)
+        check_paths(Path(source) if isinstance(source, (str, Path)) else None, Path(out))
+    asset = load(source, subdivision=options.subdivision) if isinstance(source, (str, Path)) else source
     watch.lap("load")
     backend.select(options.device)
     run = _Job(asset, options, watch)
@@ -105,6 +109,13 @@ def simplify(
         watch.lap("report")
     result.seconds = {**watch.stages, "total": watch.total}
     return result
+
+
+def check_paths(source: Path | None, out: Path) -> None:
+    """Raise InputError before any work if the result could not be written, or would replace the input."""
+    check_writable(out)
+    if source is not None and out.resolve() == source.resolve():
+        raise InputError(f"{out}: is the input itself, which is never changed; choose another name")
 
 
 class _Job:
@@ -129,11 +140,13 @@ class _Job:
         if options.init in ("decimate", "sphere"):
             self.start = make_start(self.reference, options, self.sampler, triangles)
         else:
-            self.start = loaded_start(Path(options.init), (np.array(self.frame[0]), self.frame[1]), self.reference, options)
+            self.start = loaded_start(
+                Path(options.init), (np.array(self.frame[0]), self.frame[1]), self.reference, options
+            )
         self.asset = asset
         watch.lap("start")
 
-    def fit(self, progress: Progress | None, checkpointer, with_report: bool) -> SimplifyResult:  # noqa: ANN001
+    def fit(self, progress: Progress | None, checkpointer, with_report: bool) -> SimplifyResult:
         from appearance_opt.fit.loop import FitOptions, fit
         from appearance_opt.fit.model import Model, Rates
         from appearance_opt.fit.validation import Validation
@@ -141,11 +154,14 @@ class _Job:
         from appearance_opt.reference.pool import ReferencePool
 
         o = self.options
-        rates = Rates(o.position_rate, o.normal_rate, o.color_rate, o.material_rate)
-        model = Model(self.start.mesh, self.start.maps, frozenset(o.fit), rates)
-        pool = ReferencePool(self.reference, self.sampler, o.pool, o.views, o.resolution, samples=4)
+        pool = ReferencePool(self.reference, self.sampler, o.pool, o.views, o.resolution, POOL_SAMPLES)
         held_out = self.sampler.held_out(1).draw(0, VALIDATION_VIEWS)
         validation = Validation(self.reference, held_out, min(o.resolution, 256))
+        model = Model(self.start.mesh, self.start.maps, frozenset(o.fit), Rates())
+        quality, rates = effort(validation.psnr(model), self.start.relative)
+        given = (o.position_rate, o.normal_rate, o.color_rate, o.material_rate)
+        defaults = (rates.position, rates.normal, rates.base_color, rates.material)
+        model.set_rates(Rates(*(d if g is None else g for g, d in zip(given, defaults, strict=True))))
         self.watch.lap("set-up")
         seconds = None
         if o.budget is not None:
@@ -159,6 +175,7 @@ class _Job:
             laplacian=o.laplacian,
             relative=relative,
             background=o.background_color(),
+            quality=quality,
             seed=o.seed,
         )
         fitted = fit(model, pool, validation, fit_options, progress, checkpointer)
@@ -181,7 +198,25 @@ class _Job:
         return SimplifyResult(result, begin, fitted, len(self.start.mesh.faces), self.asset.triangle_count, notes=notes)
 
 
-def clean_maps(model, known: NDArray) -> dict:  # noqa: ANN001 - fit.model.Model
+def effort(psnr: float, likeness: bool) -> tuple[Quality, Rates]:
+    """Sampling and learning rates for a start of the given held-out PSNR (dB).
+
+    A good start is easily spoilt: large steps undo it before they find something better, and the aliasing
+    of one sample per pixel, small beside the error of a poor start, biases the fit towards flat maps.
+    ``likeness``: False for a start that knows nothing (a sphere).
+    """
+    from appearance_opt.fit.model import Rates
+    from appearance_opt.render.gradient import Quality
+
+    if not likeness:
+        return Quality(1.0, 4, 1), Rates(0.05, 0.01, 0.02, 0.01)
+    factor = float(np.clip(10 ** ((25.0 - psnr) / 30.0), 0.3, 1.3))
+    rate = 0.003 * factor
+    quality = Quality(1.0, 8, 1) if psnr < GOOD_START else Quality(1.0, 16, 4, sample_width=1.0)
+    return quality, Rates(rate, rate, rate, rate)
+
+
+def clean_maps(model, known: NDArray) -> dict:
     """The model's maps and constants, texels outside of all charts filled from the inside."""
     from appearance_opt.initial.fill import fill
     from appearance_opt.initial.transfer import texel_coverage
@@ -201,7 +236,9 @@ def clean_maps(model, known: NDArray) -> dict:  # noqa: ANN001 - fit.model.Model
 def in_frame(asset: Asset, centre: tuple[float, float, float], scale: float) -> Asset:
     """The asset moved by -centre and divided by scale (computed in double precision)."""
     c = np.asarray(centre)
-    moved = [replace(m, positions=((m.positions.astype(np.float64) - c) / scale).astype(np.float32)) for m in asset.meshes]
+    moved = [
+        replace(m, positions=((m.positions.astype(np.float64) - c) / scale).astype(np.float32)) for m in asset.meshes
+    ]
     return replace(asset, meshes=tuple(moved))
 
 
@@ -216,7 +253,7 @@ def support(positions: NDArray, count: int = 256) -> NDArray[np.float64]:
     return positions[np.unique(best)].astype(np.float64)
 
 
-def _checkpointer(asset: Asset, options: SimplifyOptions, folder: str | Path | None, resume: bool):  # noqa: ANN202
+def _checkpointer(asset: Asset, options: SimplifyOptions, folder: str | Path | None, resume: bool):
     if folder is None:
         if resume:
             raise InputError("--resume needs --checkpoint DIR")
@@ -228,9 +265,3 @@ def _checkpointer(asset: Asset, options: SimplifyOptions, folder: str | Path | N
         digest.update(mesh.positions.tobytes())
         digest.update(mesh.faces.tobytes())
     return Checkpointer(Path(folder), digest.hexdigest(), resume, CHECKPOINT_SECONDS)
-
-
-def _asset_type() -> type:
-    from appearance_opt.asset.types import Asset
-
-    return Asset

@@ -57,7 +57,7 @@ def make_start(reference: MeshReference, options: SimplifyOptions, sampler: View
     if options.init == "sphere":
         mesh = sphere(triangles, sampler.centre, 0.6 * sampler.radius, size)
         maps = random_maps(size, options.seed, "normal" in options.fit)
-        return Start(mesh, maps, False, np.zeros((size, size), bool))
+        return Start(mesh, {**maps}, False, np.zeros((size, size), bool))
     merged = reference.merged
     faces = merged.faces
     weight = None
@@ -78,10 +78,12 @@ def transferred(reference: MeshReference, mesh: LatentMesh, size: int) -> Start:
     missed = result.missed.sum() / max(result.covered.sum(), 1)
     if missed > 0.01:
         log.warning("the transfer found no reference point for %.1f %% of the texels; they were filled", 100 * missed)
-    return Start(mesh, dict(result.maps), True, result.covered)
+    return Start(mesh, {**result.maps}, True, result.covered)
 
 
-def loaded_start(path: Path, to_fit_frame: tuple[NDArray, float], reference: MeshReference, options: SimplifyOptions) -> Start:
+def loaded_start(
+    path: Path, to_fit_frame: tuple[NDArray, float], reference: MeshReference, options: SimplifyOptions
+) -> Start:
     """The mesh of a file as a start: its shape is kept, atlas and maps are made anew."""
     from appearance_opt.asset import load
     from appearance_opt.asset.normals import weld

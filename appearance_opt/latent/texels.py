@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 COLORS = ("red", "green", "blue")
 BOUNDS = {
-    **{c: (0.0, 1.0) for c in COLORS},
+    **dict.fromkeys(COLORS, (0.0, 1.0)),
     "roughness": (0.08, 1.0),
     "metalness": (0.0, 1.0),
     "gamma": (0.0, 1.0),

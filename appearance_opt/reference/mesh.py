@@ -85,7 +85,6 @@ class MeshReference:
         with dr.suspend_grad():
             return deferred.render_image(self.scene, self.surface, self.maps, records, grid, samples)
 
-
     def sample(self, triangle: mi.UInt32, b1: mi.Float, b2: mi.Float, area: mi.Float) -> SurfaceSample:
         """Appearance at barycentric points of triangles, averaged over a patch of ``area`` (world units
         squared). Used by the closed-form transfer."""

@@ -84,7 +84,12 @@ def render(
 
 
 def surrogate(
-    frame: Frame, surface: Surface, maps: MaterialMaps, edge_list: EdgeList | None, image_gradient: mi.Float, quality: Quality
+    frame: Frame,
+    surface: Surface,
+    maps: MaterialMaps,
+    edge_list: EdgeList | None,
+    image_gradient: mi.Float,
+    quality: Quality,
 ) -> mi.Float:
     """Scalar whose derivative is the loss's, for ``image_gradient`` = dLoss/dImage (pixels * 4).
 

@@ -78,7 +78,9 @@ def pixel_grid(views: int, resolution: int) -> tuple[mi.UInt32, mi.UInt32, mi.UI
     return dr.gather(mi.UInt32, view, keep), dr.gather(mi.UInt32, column, keep), dr.gather(mi.UInt32, row, keep)
 
 
-def trace(scene: mi.Scene, records: mi.Float, view: mi.UInt32, x: mi.Float, y: mi.Float, resolution: mi.Float) -> Samples:
+def trace(
+    scene: mi.Scene, records: mi.Float, view: mi.UInt32, x: mi.Float, y: mi.Float, resolution: mi.Float
+) -> Samples:
     """Closest hit of the camera rays through pixel positions (x, y) of the given views."""
     return trace_depth(scene, records, view, x, y, resolution)[0]
 

@@ -137,9 +137,7 @@ def sample_edges(
     upper = dr.cumsum(length)
     total = float(upper[dr.width(upper) - 1])
     count = min(max(int(total * density), 1), MAX_SAMPLES)
-    points = _points(
-        edges, vertices, records, size, grid.views, index, upper, dr.opaque(mi.Float, total), count, seed
-    )
+    points = _points(edges, vertices, records, size, grid.views, index, upper, dr.opaque(mi.Float, total), count, seed)
     x, y, depth = points[4], points[5], points[6]
     nx, ny = points[2], points[3]
     view = points[1]

@@ -180,11 +180,9 @@ def downsample(texels: mi.Float, size: tuple[int, int], channels: int) -> mi.Flo
     y, x = i // half_w, i % half_w
     x0, y0 = 2 * x, 2 * y
     x1, y1 = dr.minimum(x0 + 1, width - 1), dr.minimum(y0 + 1, height - 1)
-    total = None
-    for yy in (y0, y1):
-        for xx in (x0, x1):
-            t = dr.gather(mi.ArrayXf, texels, yy * width + xx, shape=(channels, half_w * half_h))
-            total = t if total is None else total + t
+    corners = [(yy, xx) for yy in (y0, y1) for xx in (x0, x1)]
+    shape = (channels, half_w * half_h)
+    total = sum(dr.gather(mi.ArrayXf, texels, yy * width + xx, shape=shape) for yy, xx in corners)
     out = dr.empty(mi.Float, half_w * half_h * channels)
     dr.scatter(out, total * 0.25, i, mode=dr.ReduceMode.Permute)
     return out

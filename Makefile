@@ -1,0 +1,44 @@
+# Everything a newcomer needs. Each target sets up what it needs first: a virtual environment, and libLLVM.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+# a test must find one core as well as many
+export PIP_DISABLE_PIP_VERSION_CHECK := 1
+
+.PHONY: help demo test lint bench docs quality clean
+
+help:
+	@echo "make demo     simplify the embedded scene to 2 % of its triangles (out/demo)"
+	@echo "make test     linters, type checker, tests"
+	@echo "make bench    time a step and its stages (docs/performance.md)"
+	@echo "make docs     render docs/ to out/docs"
+
+$(STAMP): pyproject.toml scripts/setup.sh
+	PYTHON=$(PYTHON) bash scripts/setup.sh $(VENV)
+	@touch $@
+
+demo: $(STAMP)
+	@mkdir -p out/demo
+	test -f out/demo/relic.glb || $(BIN)/python -m scenes.build relic out/demo/relic.glb
+	$(BIN)/appearance-opt simplify out/demo/relic.glb --ratio 0.02 --out out/demo/relic_2pct.glb
+
+lint: $(STAMP)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+test: lint
+	$(BIN)/python -m pytest
+
+bench: $(STAMP)
+	$(BIN)/python -m experiments.bench
+
+quality: $(STAMP)
+	$(BIN)/python -m experiments.quality
+
+docs: $(STAMP)
+	$(BIN)/python scripts/build_docs.py out/docs
+
+clean:
+	rm -rf $(VENV) out build *.egg-info

@@ -1,0 +1,190 @@
+"""The command line: parse, call a job, print. No heavy import happens before a command runs."""
+
+from __future__ import annotations
+
+import errno
+import logging
+import sys
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from appearance_opt import __version__
+from appearance_opt.errors import AppearanceError
+
+app = typer.Typer(
+    add_completion=False,
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+    help="Simplify 3D assets so that the result looks the same.",
+)
+
+
+def main() -> None:
+    """Entry point: every expected failure is one line and exit code 2."""
+    logging.basicConfig(level=logging.WARNING, format="%(levelname)s: %(message)s")
+    try:
+        app(standalone_mode=False)
+    except AppearanceError as error:
+        _fail(str(error))
+    except OSError as error:
+        reason = "the disk is full" if error.errno == errno.ENOSPC else (error.strerror or str(error))
+        _fail(f"{error.filename or 'file'}: {reason}")
+    except KeyboardInterrupt:
+        _fail("interrupted: nothing was written", 130)
+    except MemoryError:
+        _fail("not enough memory; try a smaller --texture-size, --resolution or --pool")
+    except Exception as error:
+        # the parser's own errors (typer may bundle its parser, so they are known by what they can do)
+        if not hasattr(error, "format_message"):
+            raise
+        _fail(error.format_message())
+
+
+def _fail(message: str, code: int = 2) -> None:
+    print("error: " + " ".join(message.split()), file=sys.stderr)
+    sys.exit(code)
+
+
+def _version(show: bool) -> None:
+    if show:
+        print(f"appearance-opt {__version__}")
+        raise SystemExit(0)
+
+
+@app.callback()
+def _root(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
+    ] = False,
+) -> None:
+    """Simplify 3D assets so that the result looks the same."""
+
+
+@app.command()
+def simplify(
+    source: Annotated[Path, typer.Argument(metavar="INPUT", help=".glb .gltf .usd* .obj .ply .stl")],
+    out: Annotated[Path, typer.Option(help="Result: .glb .gltf .usd* .obj")],
+    triangles: Annotated[int | None, typer.Option(help="At most this many triangles.")] = None,
+    ratio: Annotated[float | None, typer.Option(help="Fraction of the input's triangles instead.")] = None,
+    preset: Annotated[str | None, typer.Option(help="draft, default or final.")] = None,
+    texture_size: Annotated[int | None, typer.Option(help="Texels per side of the maps (power of two).")] = None,
+    resolution: Annotated[int | None, typer.Option(help="Pixels per side of a training view.")] = None,
+    views: Annotated[int | None, typer.Option(help="Views per step.")] = None,
+    pool: Annotated[int | None, typer.Option(help="Reference views rendered, each used many times.")] = None,
+    steps: Annotated[int | None, typer.Option(help="Stop after this many steps.")] = None,
+    budget: Annotated[str | None, typer.Option(help="Wall-clock time for everything: 60s, 5m.")] = None,
+    fit: Annotated[str | None, typer.Option(help="Subset of shape,normal,material.")] = None,
+    init: Annotated[str | None, typer.Option(help="decimate, sphere, or a file to start from.")] = None,
+    loss: Annotated[str | None, typer.Option(help="log-srgb-l1, log-srgb-l2, l1, l2, smape, relative-l2.")] = None,
+    laplacian: Annotated[float | None, typer.Option(help="Weight of the Laplacian (0: off).")] = None,
+    relative: Annotated[
+        bool | None, typer.Option("--relative/--absolute", help="Laplacian of the start, or 0.")
+    ] = None,
+    position_rate: Annotated[float | None, typer.Option(help="In units of the local edge length.")] = None,
+    normal_rate: Annotated[float | None, typer.Option(help="Learning rate of the normal map.")] = None,
+    color_rate: Annotated[float | None, typer.Option(help="Learning rate of the base colour.")] = None,
+    material_rate: Annotated[float | None, typer.Option(help="Learning rate of roughness, metalness.")] = None,
+    background: Annotated[str | None, typer.Option(help="random, black, white, grey or r,g,b.")] = None,
+    light: Annotated[str | None, typer.Option(help="point (random) or headlight.")] = None,
+    seed: Annotated[int | None, typer.Option(help="Seed of views and lights.")] = None,
+    keep_hidden: Annotated[bool | None, typer.Option(help="Keep geometry that nobody sees.")] = None,
+    subdivision: Annotated[int | None, typer.Option(help="Level of USD subdivision surfaces.")] = None,
+    variant: Annotated[list[str] | None, typer.Option(help="USD variant: set=name (repeatable).")] = None,
+    device: Annotated[str | None, typer.Option(help="auto, cpu or cuda.")] = None,
+    report: Annotated[Path | None, typer.Option(help="Folder for the report [OUT's name + .report].")] = None,
+    no_report: Annotated[bool, typer.Option("--no-report", help="Write no report.")] = False,
+    checkpoint: Annotated[Path | None, typer.Option(help="Folder for checkpoints.")] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on from the checkpoint.")] = False,
+    config: Annotated[Path | None, typer.Option(help="TOML file with the same keys.")] = None,
+) -> None:
+    """Write an asset with fewer triangles that looks like INPUT."""
+    arguments = dict(locals())
+    from appearance_opt.config import OPTION_NAMES, read_toml, simplify_options
+
+    given = {k: v for k, v in arguments.items() if k in OPTION_NAMES and v is not None}
+
+    values: dict[str, Any] = read_toml(config) if config is not None else {}
+    if "triangles" in given or "ratio" in given:  # one replaces the other
+        values.pop("triangles", None)
+        values.pop("ratio", None)
+    values.update(given)
+    name = preset or values.pop("preset", None) or "default"
+    values.pop("preset", None)
+    options = simplify_options(name, **values)
+    from appearance_opt.asset import load
+    from appearance_opt.jobs.simplify import check_paths
+    from appearance_opt.jobs.simplify import simplify as run
+    from appearance_opt.progress import TerminalProgress
+
+    check_paths(source, out)
+    asset = load(source, subdivision=options.subdivision, variants=_variants(variant))
+    folder = None if no_report else report or out.with_name(out.stem + ".report")
+    with TerminalProgress() as progress:
+        result = run(asset, out, options, report=folder, checkpoint=checkpoint, resume=resume, progress=progress)
+    for note in result.notes:
+        print(f"note: {note}", file=sys.stderr)
+    curve = result.fit.curve
+    quality = f", held-out PSNR {curve[0].psnr:.2f} -> {max(p.psnr for p in curve):.2f} dB" if curve else ""
+    print(f"{out}: {result.triangles} of {result.source_triangles} triangles, {result.seconds['total']:.1f} s{quality}")
+    if folder is not None:
+        print(f"report: {folder / 'report.html'}")
+
+
+@app.command()
+def compare(
+    reference: Annotated[Path, typer.Argument(metavar="REFERENCE")],
+    candidate: Annotated[Path, typer.Argument(metavar="CANDIDATE")],
+    as_json: Annotated[bool, typer.Option("--json", help="Print the metrics as JSON.")] = False,
+    out: Annotated[Path | None, typer.Option(help="Folder for pictures and a report.")] = None,
+    views: Annotated[int, typer.Option(help="Number of views.", min=1)] = 12,
+    resolution: Annotated[int, typer.Option(help="Pixels per side.", min=16)] = 384,
+    seed: Annotated[int, typer.Option(help="Seed of views and lights.")] = 0,
+    device: Annotated[str, typer.Option(help="auto, cpu or cuda.")] = "auto",
+) -> None:
+    """Measure how different two assets look: PSNR, FLIP, silhouettes."""
+    from appearance_opt.jobs.compare import compare as run
+
+    metrics = run(reference, candidate, views=views, resolution=resolution, seed=seed, device=device, out=out).metrics
+    if as_json:
+        import json
+        from dataclasses import asdict
+
+        print(json.dumps(asdict(metrics), indent=1))
+        return
+    print(f"PSNR, covered pixels  {metrics.psnr_covered:7.2f} dB")
+    print(f"PSNR, whole image     {metrics.psnr:7.2f} dB")
+    print(f"FLIP                  {metrics.flip:7.4f}")
+    print(f"silhouette IoU        {metrics.silhouette_iou:7.4f}")
+    print(f"silhouette shift      {metrics.silhouette_shift:7.3f} px")
+
+
+@app.command()
+def doctor(as_json: Annotated[bool, typer.Option("--json", help="Print as JSON.")] = False) -> None:
+    """Say what this machine offers, and what to install when something is missing."""
+    from appearance_opt.doctor import diagnose
+
+    found = diagnose()
+    if as_json:
+        import json
+
+        print(json.dumps(found, indent=1))
+    else:
+        for name, value in found.items():
+            print(f"{name:16} {value}")
+    if found["problem"]:
+        raise AppearanceError(str(found["problem"]))
+
+
+def _variants(given: list[str] | None) -> dict[str, str] | None:
+    from appearance_opt.errors import InputError
+
+    out = {}
+    for text in given or []:
+        name, separator, choice = text.partition("=")
+        if not separator or not name or not choice:
+            raise InputError(f"--variant {text}: write it as set=name")
+        out[name] = choice
+    return out or None

@@ -1,0 +1,49 @@
+"""Progress on a terminal: a bar where there is one, a line now and then where not."""
+
+from __future__ import annotations
+
+import sys
+import time
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from types import TracebackType
+
+    from rich.progress import Progress
+
+
+class TerminalProgress:
+    """Shows step, loss, held-out PSNR, steps per second and time left. A context manager."""
+
+    def __init__(self) -> None:
+        self._bar: Progress | None = None
+        self._last = 0.0
+
+    def __enter__(self) -> TerminalProgress:
+        if sys.stderr.isatty():
+            from rich.console import Console
+            from rich.progress import BarColumn, Progress, TextColumn
+
+            columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[info]}"))
+            self._bar = Progress(*columns, console=Console(stderr=True), transient=True)
+            self._bar.start()
+            self._task = self._bar.add_task("preparing", total=1.0, info="")
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        if self._bar is not None:
+            self._bar.stop()
+
+    def update(
+        self, step: int, fraction: float, loss: float, psnr: float, steps_per_second: float, seconds_left: float | None
+    ) -> None:
+        """See ``fit.loop.Progress``."""
+        left = "" if seconds_left is None else f"  {seconds_left:.0f} s left"
+        info = f"step {step}  loss {loss:.5f}  held-out {psnr:.2f} dB  {steps_per_second:.1f} steps/s{left}"
+        if self._bar is not None:
+            self._bar.update(self._task, description="fitting", completed=fraction, info=info)
+        elif time.monotonic() - self._last > 5:
+            self._last = time.monotonic()
+            print(f"{100 * fraction:3.0f} %  {info}", file=sys.stderr)

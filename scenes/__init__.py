@@ -1,0 +1,1 @@
+"""Procedural scenes of this project: ``python -m scenes.build --list``. Nothing here is downloaded."""
