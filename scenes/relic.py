@@ -27,18 +27,21 @@ SETTING = Material("setting", (0.85, 0.50, 0.13), roughness=0.30, metalness=1.0)
 
 MEDALLIONS = 8
 
+_FULL_COUNT = 486_000
+"""Triangles at density 1, where every band has the rows written beside it."""
+
 
 def relic(triangles: int = 400_000, texture_size: int = 2048) -> Asset:
     """The urn with about ``triangles`` triangles. ``texture_size``: texels across the body's maps; the
     other parts have half."""
-    density = np.sqrt(triangles / 400_000)
+    density = float(np.sqrt(triangles / _FULL_COUNT))
     body_profile, body_sheet = _body(density)
     half = max(64, texture_size // 2)
     meshes = [
-        _turned(_plinth(density), _columns(256, density), half, "plinth", _octagon),
-        _turned(_foot(density), _columns(384, density), half, "foot"),
-        _turned((body_profile, body_sheet), _columns(640, density), texture_size, "body"),
-        _turned(_lid(density), _columns(448, density), half, "lid"),
+        _turned(_plinth(density), _columns(128, density), half, "plinth", _octagon),
+        _turned(_foot(density), _columns(256, density), half, "foot"),
+        _turned((body_profile, body_sheet), _columns(528, density), texture_size, "body"),
+        _turned(_lid(density), _columns(256, density), half, "lid"),
         _handles(density, half),
         *_jewels(body_profile, body_sheet, density),
     ]
@@ -67,7 +70,7 @@ def _foot(density: float) -> tuple[Profile, Sheet]:
         (
             curve((0.086, 0.0625), (0.081, 0.076), (0.062, 0.089), (0.041, 0.097)),
             COBALT,
-            44,
+            34,
             o.petals(16, 0.0045, GOLD, TURQUOISE, GOLD),
         ),
         (arc((0.040, 0.098), (0.037, 0.106), 0.003), GOLD, 14, o.beads(24)),
@@ -78,7 +81,7 @@ def _foot(density: float) -> tuple[Profile, Sheet]:
             o.flutes(16, 0, 0.0022, 0.16, GOLD),
         ),
         (arc((0.033, 0.139), (0.034, 0.145), 0.003), GOLD, 8, o.rope(40, 1.0, 0.0012)),
-        (arc((0.034, 0.146), (0.034, 0.180), 0.023, 60), GOLD, 44, o.gadroons(14, 3.0, 0.0065)),
+        (arc((0.034, 0.146), (0.034, 0.180), 0.023, 60), GOLD, 36, o.gadroons(14, 3.0, 0.0065)),
         (arc((0.034, 0.181), (0.033, 0.187), 0.003), GOLD, 8, o.rope(40, 1.0, 0.0012)),
         (curve((0.031, 0.188), (0.027, 0.195), (0.031, 0.202)), COBALT, 10, None),
         (arc((0.034, 0.203), (0.038, 0.210), 0.003), GOLD, 10, o.beads(26)),
@@ -95,28 +98,28 @@ def _body(density: float) -> tuple[Profile, Sheet]:
         (
             curve((0.043, 0.219), (0.078, 0.231), (0.110, 0.257), (0.132, 0.292)),
             COBALT,
-            58,
+            44,
             o.petals(16, 0.0065, GOLD, IVORY, GOLD),
         ),
-        (arc((0.133, 0.293), (0.138, 0.304), 0.0045), GOLD, 14, o.rope(96, 1.6, 0.0022)),
-        (curve((0.139, 0.305), (0.1515, 0.342), (0.1535, 0.372), (0.148, 0.404), (0.1365, 0.432)), COBALT, 64, belly),
-        (arc((0.136, 0.433), (0.131, 0.443), 0.0045), GOLD, 14, o.rope(96, -1.6, 0.0022)),
-        (curve((0.130, 0.444), (0.124, 0.458), (0.1145, 0.469)), IVORY, 30, o.meander(26, 0.0014, COBALT)),
+        (arc((0.133, 0.293), (0.138, 0.304), 0.0045), GOLD, 11, o.rope(96, 1.6, 0.0022)),
+        (curve((0.139, 0.305), (0.1515, 0.342), (0.1535, 0.372), (0.148, 0.404), (0.1365, 0.432)), COBALT, 44, belly),
+        (arc((0.136, 0.433), (0.131, 0.443), 0.0045), GOLD, 11, o.rope(96, -1.6, 0.0022)),
+        (curve((0.130, 0.444), (0.124, 0.458), (0.1145, 0.469)), IVORY, 24, o.meander(22, 0.0014, COBALT)),
         (arc((0.114, 0.4695), (0.107, 0.476), 0.002), GOLD, 12, o.beads(72)),
         (
             curve((0.106, 0.477), (0.090, 0.490), (0.069, 0.499)),
             COBALT,
-            34,
+            26,
             o.tongues(24, 0.0034, TURQUOISE, CORAL, GOLD),
         ),
         (arc((0.068, 0.500), (0.064, 0.507), 0.003), GOLD, 10, o.rope(56, 1.4, 0.0016)),
         (
             curve((0.062, 0.508), (0.0545, 0.528), (0.053, 0.552), (0.060, 0.578)),
             IVORY,
-            40,
+            28,
             o.flutes(26, 7.0, 0.0026, 0.14, GOLD),
         ),
-        (arc((0.061, 0.579), (0.067, 0.593), 0.005), GOLD, 18, o.gadroons(36, 0, 0.0032)),
+        (arc((0.061, 0.579), (0.067, 0.593), 0.005), GOLD, 14, o.gadroons(36, 0, 0.0032)),
         (curve((0.068, 0.594), (0.071, 0.597), (0.071, 0.601)), GOLD, 4, None),
         (line((0.071, 0.601), (0.067, 0.603)), GOLD, 2, None),
         (line((0.067, 0.603), (0, 0.603)), GOLD, 2, None),
@@ -133,7 +136,7 @@ def _lid(density: float) -> tuple[Profile, Sheet]:
         (
             curve((0.0625, 0.616), (0.059, 0.636), (0.045, 0.654), (0.024, 0.664)),
             GOLD,
-            56,
+            46,
             o.scales(20, 5, 0.0030, COBALT, TURQUOISE, GOLD),
         ),
         (arc((0.023, 0.665), (0.022, 0.673), 0.003), GOLD, 12, o.beads(16)),
@@ -174,11 +177,11 @@ def _octagon(angle: NDArray) -> NDArray:
 def _handles(density: float, texture: int) -> Mesh:
     """Both handles: a twisted S from belly to rim with collars, and three scrolls that curl off it."""
     sheet = Sheet(
-        (Band(GOLD, max(24, round(300 * density)), o.rope(5, 16.0, 0.0022)),),
+        (Band(GOLD, max(24, round(240 * density)), o.rope(5, 16.0, 0.0022)),),
         np.array([0.0, 1.0]), np.array([0.055]), np.array([0.30]), 71,
     )  # fmt: skip
     scroll = Sheet(
-        (Band(GOLD, max(16, round(110 * density)), o.rope(4, 5.0, 0.0012)),),
+        (Band(GOLD, max(16, round(80 * density)), o.rope(4, 5.0, 0.0012)),),
         np.array([0.0, 1.0]), np.array([0.035]), np.array([0.14]), 73,
     )  # fmt: skip
     material = paint(sheet, texture // 4, texture, "handles")
@@ -186,7 +189,7 @@ def _handles(density: float, texture: int) -> Mesh:
         (0.140, 0.420), (0.165, 0.408), (0.195, 0.420), (0.212, 0.455), (0.210, 0.505), (0.188, 0.553),
         (0.152, 0.588), (0.112, 0.600), (0.082, 0.594), (0.064, 0.587), count=400,
     )  # fmt: skip
-    columns = max(10, 2 * round(20 * density))
+    columns = max(10, 2 * round(10 * density))
     parts = [tube(main, _handle_radius, sheet, columns, material, "handle")]
     for centre, outer, start, hand, turns in (
         ((0.196, 0.392), 0.030, 1.9, -1, 1.7),
@@ -248,15 +251,15 @@ def _gem(radius: float, height: float, material: Material, density: float) -> Me
     polar = np.linspace(-np.pi / 2, np.pi / 2, 60)
     outline = np.stack([radius * np.cos(polar), height * np.sin(polar)], axis=1)
     outline[[0, -1], 0] = 0.0
-    band = Band(GOLD, max(6, round(20 * density)))
-    return turn(*profile_sheet([Piece(outline, band)], 0), _columns(48, density), material, "gem")
+    band = Band(GOLD, max(6, round(14 * density)))
+    return turn(*profile_sheet([Piece(outline, band)], 0), _columns(32, density), material, "gem")
 
 
 def _setting(radius: float, thickness: float, density: float) -> Mesh:
     """A corded ring on a disc about the origin."""
     pieces = [
         (line((0, -0.004), (radius, -0.004)), GOLD, 1, None),
-        (arc((radius, -0.004), (radius, thickness), 0.9 * thickness), GOLD, 14, o.rope(26, 1.5, 0.0007)),
+        (arc((radius, -0.004), (radius, thickness), 0.9 * thickness), GOLD, 9, o.rope(20, 1.5, 0.0007)),
         (line((radius, thickness), (0, thickness - 0.003)), GOLD, 1, None),
     ]
-    return turn(*profile_sheet(_pieces(pieces, density), 0), _columns(80, density), SETTING, "setting")
+    return turn(*profile_sheet(_pieces(pieces, density), 0), _columns(64, density), SETTING, "setting")
