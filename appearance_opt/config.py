@@ -20,9 +20,9 @@ LIGHTS = ("point", "headlight")
 DEVICES = ("auto", "cpu", "cuda")
 
 PRESETS: dict[str, dict[str, Any]] = {
-    "draft": {"budget": 17.0, "resolution": 192, "pool": 96},
-    "default": {"budget": 65.0, "resolution": 256, "pool": 320},
-    "final": {"budget": 280.0, "resolution": 320, "pool": 640},
+    "draft": {"budget": 17.0, "resolution": 192, "pool": 64},
+    "default": {"budget": 65.0, "resolution": 256, "pool": 160},
+    "final": {"budget": 280.0, "resolution": 320, "pool": 480},
 }
 """What each preset sets; everything else keeps its default. See docs/performance.md for how they were
 chosen."""
@@ -49,7 +49,7 @@ class SimplifyOptions:
     views: int = 4
     steps: int | None = None
     budget: float | None = None
-    pool: int = 320
+    pool: int = 160
     fit: tuple[str, ...] = ("shape", "normal", "material")
     init: str = "decimate"
     loss: str = "log-srgb-l1"

@@ -28,9 +28,12 @@ MINIMUM_COSINE = -0.6
 """A collapse may not turn the normal of a face it keeps by more than the angle of this cosine. Thin parts need
 a loose bound: with 0.2 it forbids all cheap collapses there (flight_helmet loses 2 dB)."""
 
-ROUND_FRACTION = 0.12
+ROUND_FRACTION, EARLY_FRACTION = 0.12, 0.5
 """Share of all edges, cheapest first, among which a round chooses. Smaller is closer to one collapse at a
-time, and slower."""
+time, and slower. Early rounds, far from the budget, can be bolder: what they collapse would go anyway."""
+
+EARLY = 6
+"""Rounds are early while there are more than this many times the budget of triangles."""
 
 
 @dataclass
@@ -121,13 +124,14 @@ def _round(state: _State, triangles: int, strict: bool) -> bool:
     cost = quadrics.evaluate(q, target)
     # between a sum over the surface (which gives small parts away) and a mean (which forgets large ones)
     cost /= np.sqrt(np.maximum(q[:, 0] + q[:, 3] + q[:, 5], 1e-300))
-    # of edges that cost the same (nothing, in flat regions) the shorter go first
-    length = np.sum((state.positions[a] - state.positions[b]) ** 2, axis=1)
-    order = np.lexsort((length, cost))
     needed = (len(state.faces) - triangles + 1) // 2
-    limit = max(int(ROUND_FRACTION * len(edges)), min(needed, 16), 1)
-    rank = np.empty(len(edges), np.int64)
-    rank[order] = np.arange(len(edges))
+    fraction = EARLY_FRACTION if len(state.faces) > EARLY * triangles else ROUND_FRACTION
+    limit = min(max(int(fraction * len(edges)), min(needed, 16), 1), len(edges))
+    cheap = np.argpartition(cost, limit - 1)[:limit]
+    # of edges that cost the same (nothing, in flat regions) the shorter go first
+    length = np.sum((state.positions[a[cheap]] - state.positions[b[cheap]]) ** 2, axis=1)
+    rank = np.full(len(edges), len(edges))
+    rank[cheap[np.lexsort((length, cost[cheap]))]] = np.arange(limit)
     chosen = _independent(state, edges, rank, limit)
     legal = _legal(state, edges[chosen], target[chosen], uses[chosen], strict)
     state.blocked = np.concatenate([state.blocked, keys[chosen[~legal]]])

@@ -30,7 +30,7 @@ log = logging.getLogger(__name__)
 VALIDATION_VIEWS = 8
 CHECKPOINT_SECONDS = 10.0
 
-POOL_SAMPLES = 9
+POOL_SAMPLES = 4
 """Rays per pixel of the reference's images."""
 
 GOOD_START = 28.0

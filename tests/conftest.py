@@ -1,0 +1,65 @@
+"""Shared fixtures. Tests run on the CPU variant."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from appearance_opt import backend
+from appearance_opt.asset.types import Asset, Material, Mesh, Texture
+
+
+@pytest.fixture(scope="session", autouse=True)
+def variant() -> str:
+    """All tests share the LLVM variant."""
+    return backend.select("cpu").variant
+
+
+@pytest.fixture(scope="session")
+def assets_dir() -> Path:
+    """Real models, where the checkout has them beside it."""
+    folder = Path(__file__).resolve().parents[2] / "shared" / "assets"
+    if not folder.is_dir():
+        pytest.skip("the folder ../shared/assets is not there")
+    return folder
+
+
+def grid_sphere(rows: int, columns: int, radius: float = 1.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """UV sphere with a seam: positions, faces, uvs (glTF convention, outward winding)."""
+    v, u = np.meshgrid(np.linspace(0, 1, rows + 1), np.linspace(0, 1, columns + 1), indexing="ij")
+    polar, azimuth = v * np.pi, u * 2 * np.pi
+    p = np.stack([np.sin(polar) * np.sin(azimuth), np.cos(polar), np.sin(polar) * np.cos(azimuth)], axis=-1)
+    i, j = (x.ravel() for x in np.meshgrid(np.arange(rows), np.arange(columns), indexing="ij"))
+    a = i * (columns + 1) + j
+    b, c, d = a + columns + 1, a + columns + 2, a + 1
+    faces = np.concatenate([np.stack([a, b, c], 1)[i < rows - 1], np.stack([a, c, d], 1)[i > 0]])
+    uvs = np.stack([u, v], axis=-1).reshape(-1, 2)
+    return (p.reshape(-1, 3) * radius).astype(np.float32), faces.astype(np.int32), uvs.astype(np.float32)
+
+
+def make_asset(rows: int = 24, columns: int = 48, size: int = 64, seed: int = 0) -> Asset:
+    """A sphere with a smooth random colour texture, roughness and metalness."""
+    positions, faces, uvs = grid_sphere(rows, columns)
+    rng = np.random.default_rng(seed)
+    x = np.linspace(0, 2 * np.pi, size, endpoint=False)
+    wave = 0.5 + 0.35 * np.sin(2 * x)[None, :] * np.cos(3 * x / 2)[:, None]
+    color = np.stack([wave, 1 - wave, 0.3 + 0.4 * rng.random() * np.ones_like(wave)], axis=-1)
+    orm = np.stack([np.ones_like(wave), 0.3 + 0.4 * wave, 0.5 * (wave > 0.5)], axis=-1)
+    to8 = lambda v: (np.clip(v, 0, 1) * 255 + 0.5).astype(np.uint8)  # noqa: E731
+    material = Material(
+        "painted",
+        roughness=1.0,
+        metalness=1.0,
+        base_color_texture=Texture(to8(color), "srgb"),
+        orm_texture=Texture(to8(orm), "linear"),
+    )
+    normals = positions / np.linalg.norm(positions, axis=1, keepdims=True)
+    return Asset((Mesh(positions, faces, normals, uvs, material=material, name="ball"),), "ball")
+
+
+@pytest.fixture(scope="session")
+def ball() -> Asset:
+    """A textured sphere of 2,208 triangles."""
+    return make_asset()

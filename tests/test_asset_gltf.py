@@ -1,0 +1,176 @@
+"""glTF in and out."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import struct
+import subprocess
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from appearance_opt.asset import load, save
+from appearance_opt.asset.tangents import split_and_tangents
+from appearance_opt.asset.types import Asset, Material, Mesh
+from appearance_opt.errors import InputError
+
+
+def write_glb(path: Path, document: dict, binary: bytes = b"") -> None:
+    text = json.dumps(document).encode()
+    text += b" " * (-len(text) % 4)
+    binary += b"\0" * (-len(binary) % 4)
+    head = struct.pack("<4sII", b"glTF", 2, 28 + len(text) + len(binary))
+    path.write_bytes(
+        head + struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(binary), b"BIN\0") + binary
+    )
+
+
+def triangle_document(**changes: object) -> tuple[dict, bytes]:
+    positions = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], np.float32)
+    document: dict = {
+        "asset": {"version": "2.0"},
+        "scenes": [{"nodes": [0]}],
+        "scene": 0,
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}}]}],
+        "accessors": [{"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC3"}],
+        "bufferViews": [{"buffer": 0, "byteLength": 36}],
+        "buffers": [{"byteLength": 36}],
+    }
+    document.update(changes)
+    return document, positions.tobytes()
+
+
+@pytest.mark.parametrize("suffix", [".glb", ".gltf"])
+def test_round_trip_is_exact(tmp_path: Path, ball: Asset, suffix: str) -> None:
+    save(ball, tmp_path / f"x{suffix}")
+    again = load(tmp_path / f"x{suffix}").meshes[0]
+    mesh = ball.meshes[0]
+    used = np.unique(mesh.faces)  # unused pole vertices are dropped on loading
+    np.testing.assert_array_equal(again.positions, mesh.positions[used])
+    np.testing.assert_array_equal(again.uvs, mesh.uvs[used])
+    np.testing.assert_array_equal(again.material.base_color_texture.pixels, mesh.material.base_color_texture.pixels)
+    np.testing.assert_array_equal(again.material.orm_texture.pixels, mesh.material.orm_texture.pixels)
+    assert again.material.base_color_texture.color_space == "srgb"
+    assert np.array_equal(used[again.faces], mesh.faces)
+
+
+@settings(max_examples=25, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(count=st.integers(1, 40), seed=st.integers(0, 2**31))
+def test_round_trip_of_random_triangles(tmp_path: Path, count: int, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    positions = rng.normal(size=(3 * count, 3)).astype(np.float32)
+    mesh = Mesh(positions, np.arange(3 * count, dtype=np.int32).reshape(-1, 3), material=Material(base_color=(0.2, 0.4, 0.6)))
+    save(Asset((mesh,)), tmp_path / "x.glb")
+    again = load(tmp_path / "x.glb").meshes[0]
+    np.testing.assert_array_equal(again.positions[again.faces], positions.reshape(-1, 3, 3))
+    assert again.material.base_color == pytest.approx((0.2, 0.4, 0.6))
+
+
+@settings(max_examples=120, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(cut=st.integers(0, 2000), flips=st.lists(st.tuples(st.integers(0, 5000), st.integers(1, 255)), max_size=4))
+def test_damaged_files_are_refused_or_read(tmp_path: Path, cut: int, flips: list[tuple[int, int]]) -> None:
+    document, binary = triangle_document()
+    write_glb(tmp_path / "whole.glb", document, binary)
+    data = bytearray((tmp_path / "whole.glb").read_bytes())
+    for at, value in flips:
+        data[at % len(data)] ^= value
+    (tmp_path / "x.glb").write_bytes(bytes(data[: max(len(data) - cut, 0)]))
+    try:
+        assert load(tmp_path / "x.glb").triangle_count > 0
+    except InputError as error:
+        assert "\n" not in str(error)
+        assert "x.glb" in str(error)
+
+
+def test_node_transforms_and_mirroring(tmp_path: Path) -> None:
+    document, binary = triangle_document(nodes=[{"children": [1], "scale": [-2, 1, 1]}, {"mesh": 0, "translation": [1, 0, 0]}])
+    write_glb(tmp_path / "x.glb", document, binary)
+    mesh = load(tmp_path / "x.glb").meshes[0]
+    p = mesh.positions[mesh.faces[0]]
+    assert {tuple(v) for v in p.tolist()} == {(-2, 0, 0), (-4, 0, 0), (-2, 1, 0)}
+    # a mirrored node keeps its outside outside
+    assert np.cross(p[1] - p[0], p[2] - p[0])[2] > 0
+
+
+def test_strips_become_triangles_of_one_winding(tmp_path: Path) -> None:
+    positions = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]], np.float32)
+    document, _ = triangle_document(bufferViews=[{"buffer": 0, "byteLength": 48}], buffers=[{"byteLength": 48}])
+    document["accessors"][0]["count"] = 4
+    document["meshes"][0]["primitives"][0]["mode"] = 5
+    write_glb(tmp_path / "x.glb", document, positions.tobytes())
+    mesh = load(tmp_path / "x.glb").meshes[0]
+    p = mesh.positions[mesh.faces]
+    assert len(p) == 2
+    assert (np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0])[:, 2] > 0).all()
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"extensionsRequired": ["KHR_draco_mesh_compression"]}, "Draco"),
+        ({"asset": {"version": "1.0"}}, "version"),
+        ({"meshes": []}, "broken"),
+        ({"bufferViews": [{"buffer": 0, "byteLength": 3600}]}, "cut short"),
+        ({"buffers": [{"byteLength": 36, "uri": "../secret.bin"}]}, "outside"),
+        ({"buffers": [{"byteLength": 36, "uri": "file:///etc/passwd"}]}, "not a file beside it"),
+        ({"buffers": [{"byteLength": 36, "uri": "absent.bin"}]}, "does not exist"),
+        ({"nodes": [{"mesh": 0, "children": [0]}]}, "ancestor"),
+    ],
+)
+def test_unusable_files_say_why(tmp_path: Path, change: dict, words: str) -> None:
+    folder = tmp_path / "asset"
+    folder.mkdir()
+    (tmp_path / "secret.bin").write_bytes(b"\0" * 36)
+    document, binary = triangle_document(**change)
+    write_glb(folder / "x.glb", document, binary)
+    with pytest.raises(InputError, match=words):
+        load(folder / "x.glb")
+
+
+def test_non_finite_positions_are_refused(tmp_path: Path) -> None:
+    document, _ = triangle_document()
+    write_glb(tmp_path / "x.glb", document, np.full((3, 3), np.nan, np.float32).tobytes())
+    with pytest.raises(InputError, match="3 positions are NaN"):
+        load(tmp_path / "x.glb")
+
+
+def test_a_degenerate_face_is_dropped_with_a_note(tmp_path: Path, ball: Asset) -> None:
+    mesh = ball.meshes[0]
+    bad = replace(mesh, faces=np.concatenate([mesh.faces, [[5, 5, 6]]]).astype(np.int32))
+    save(Asset((bad,)), tmp_path / "x.glb")
+    again = load(tmp_path / "x.glb")
+    assert again.triangle_count == len(mesh.faces)
+    assert any("1 degenerate" in n for n in again.notes)
+
+
+def test_output_passes_the_khronos_validator(tmp_path: Path, ball: Asset) -> None:
+    node = shutil.which("node")
+    found = node and subprocess.run(
+        [node, "-e", "require.resolve('gltf-validator')"], capture_output=True, cwd=Path(__file__).parents[1]
+    )
+    if not found or found.returncode:
+        pytest.skip("node with the package gltf-validator is not there")
+    mesh = ball.meshes[0]
+    index, faces, tangents = split_and_tangents(mesh.positions, mesh.normals, mesh.uvs, mesh.faces)
+    full = replace(mesh, positions=mesh.positions[index], normals=mesh.normals[index], uvs=mesh.uvs[index], faces=faces, tangents=tangents)
+    save(Asset((full,)), tmp_path / "x.glb")
+    script = (
+        "require('gltf-validator').validateBytes(new Uint8Array(require('fs').readFileSync(process.argv[1])))"
+        ".then(r => console.log(JSON.stringify(r.issues)))"
+    )
+    out = subprocess.run([node, "-e", script, str(tmp_path / "x.glb")], capture_output=True, text=True, check=True, cwd=Path(__file__).parents[1])
+    issues = json.loads(out.stdout)
+    assert issues["numErrors"] == 0, issues["messages"][:3]
+
+
+def test_real_helmet_becomes_one_scene(assets_dir: Path) -> None:
+    asset = load(assets_dir / "flight_helmet" / "FlightHelmet.gltf")
+    assert asset.triangle_count == 94722
+    assert len({id(m.material) for m in asset.meshes}) == 5 + 1 - (6 - len(asset.meshes))
+    assert all(m.normals is not None and m.uvs is not None for m in asset.meshes)
