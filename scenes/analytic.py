@@ -59,7 +59,7 @@ def double_sheet(triangles: int = 4_000, gap: float = 0.002) -> Asset:
 def bumpy_sphere(triangles: int = 100_000, texture_size: int = 1024) -> Asset:
     """A sphere with waves, for timing at any size: the same shape and maps whatever the count."""
     positions, uvs, faces = _octahedral_grid(triangles)
-    positions = (positions * _bumps(positions)[:, None]).astype(np.float32)
+    positions = (positions * bumps(positions)[:, None]).astype(np.float32)
     material = _spotted(texture_size)
     mesh = Mesh(positions, faces, vertex_normals(positions, faces), uvs, material=material, name="bumpy_sphere")
     return Asset((mesh,), name="bumpy_sphere")
@@ -112,8 +112,8 @@ def _octahedral_grid(triangles: int) -> tuple[NDArray[np.float64], NDArray[np.fl
     return points, uvs, np.concatenate([first.reshape(-1, 3), second.reshape(-1, 3)]).astype(np.int32)
 
 
-def _bumps(direction: NDArray) -> NDArray[np.float64]:
-    """Radius by unit direction (V, 3): a few waves along fixed axes."""
+def bumps(direction: NDArray) -> NDArray[np.float64]:
+    """Radius by unit direction (V, 3): a few waves along fixed axes (the bumpy sphere's height field)."""
     axes = np.random.default_rng(5).standard_normal((9, 3))
     axes /= np.linalg.norm(axes, axis=1, keepdims=True)
     frequency = np.array((3, 4, 5, 7, 9, 12, 16, 21, 28), np.float64)

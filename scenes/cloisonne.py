@@ -38,7 +38,7 @@ def cloisonne(
         # enamel sags between its wires, the medallion is a shallow boss
         sag = 0.00025 * smoothstep(0.0, 0.004, wires)
         edge = smoothstep(0.0, 0.03, np.minimum(patch.t, 1 - patch.t))[:, None]
-        boss = 0.0035 * np.sqrt(np.clip(-medallion / (0.33 * cell), 0, 1)) * edge
+        boss = 0.0055 * np.sqrt(np.clip(-medallion / (0.30 * cell), 0, 1)) * edge
         petal_lift = 0.0016 * np.sqrt(np.clip(-rosette / 0.010, 0, 1))
         leaf_lift = 0.0012 * np.sqrt(np.clip(-foliage / 0.004, 0, 1)) * edge
         height = boss + petal_lift + leaf_lift
@@ -52,39 +52,41 @@ def _inside(distance: NDArray) -> NDArray[np.float32]:
 
 
 def _medallion_radius(angle: NDArray) -> NDArray:
-    """A pointed quatrefoil: four lobes, points up, down and to the sides between them."""
-    return 0.315 * (1 + 0.13 * np.abs(np.cos(2 * angle)) ** 3 + 0.05 * np.abs(np.sin(2 * angle)))
+    """A quatrefoil: four circles of radius 0.20 centred 0.165 up, down, left and right."""
+    off = (angle + np.pi / 4) % (np.pi / 2) - np.pi / 4
+    return 0.165 * np.cos(off) + np.sqrt(0.20**2 - (0.165 * np.sin(off)) ** 2)
 
 
 def _rosette_radius(angle: NDArray) -> NDArray:
-    return 0.075 + 0.135 * np.abs(np.cos(4 * angle)) ** 0.55
+    return 0.080 + 0.150 * np.abs(np.cos(4 * angle)) ** 0.55
 
 
 def _scrolls() -> tuple[list[NDArray], list[NDArray], list[tuple[NDArray, NDArray]]]:
-    """Curves, half widths and leaves of the four corners' scrolls and the running stem."""
+    """Curves, half widths and leaves: a scroll in every corner that springs from the stem along the
+    border, and palmettes between the medallions."""
     curves, widths, leaves = [], [], []
     for sx in (-1, 1):
         for sy in (-1, 1):
-            hand = -sx * sy
-            curl = spiral((0.365 * sx, 0.415 * sy), 0.088, 1.6, np.arctan2(-sy, -sx * 0.3), hand)
-            curves.append(curl)
-            widths.append(np.linspace(0.0105, 0.006, len(curl)))
-            centre = curl[-1]
-            disc = ring(np.full(40, 0.012), np.linspace(0, 2 * np.pi, 40), tuple(centre))
-            curves.append(disc)
-            widths.append(np.full(40, 0.012))
-            for angle, length in ((0.55, 0.10), (1.5, 0.085), (-0.5, 0.075)):
-                direction = np.array((np.cos(angle) * -sx, np.sin(angle) * sy))
-                base = np.array((0.365 * sx, 0.415 * sy)) + 0.10 * direction
-                leaves.append(leaf(tuple(base), tuple(base + length * direction), 0.020))
+            centre = np.array((0.350 * sx, 0.412 * sy))
+            curl = spiral(tuple(centre), 0.108, 1.75, sy * np.pi / 2, sx * sy)
+            disc = ring(np.full(40, 0.014), np.linspace(0, 2 * np.pi, 40), tuple(curl[-1]))
+            curves += [curl, disc]
+            widths += [np.linspace(0.0110, 0.0065, len(curl)), np.full(40, 0.014)]
+            for angle, length in ((0.25, 0.105), (-0.45, 0.095), (-1.25, 0.10), (-2.1, 0.115)):
+                direction = np.array((-sx * np.cos(angle), sy * np.sin(angle)))
+                base = centre + 0.120 * direction
+                leaves.append(leaf(tuple(base), tuple(base + length * direction), 0.023))
+            for angle, length in ((0.55, 0.12), (1.05, 0.15)):
+                direction = np.array((-sx * np.cos(angle), sy * np.sin(angle)))
+                base = np.array((0.5 * sx, 0.015 * sy)) + 0.045 * direction
+                leaves.append(leaf(tuple(base), tuple(base + length * direction), 0.024))
     for sy in (-1, 1):
         stem = np.linspace(0, 1, 200)
-        curves.append(np.stack([(stem - 0.5), sy * (0.525 - 0.012 * np.cos(4 * np.pi * stem))], axis=1))
-        widths.append(np.full(200, 0.006))
-    for sx in (-1, 1):
-        for sy in (-1, 0, 1):
-            leaves.append(leaf((0.495 * sx, 0.045 * sy), (0.495 * sx, 0.045 * sy + 0.11 * (sy or 0.01)), 0.024))
-    return curves, widths, leaves
+        curves.append(np.stack([stem - 0.5, np.full(200, 0.522 * sy)], axis=1))
+        widths.append(np.full(200, 0.0065))
+        leaves.append(leaf((0.5, 0.05 * sy), (0.5, 0.24 * sy), 0.027))
+    eye = ring(np.full(60, 0.026), np.linspace(0, 2 * np.pi, 60), (0.5, 0.0))
+    return [*curves, eye], [*widths, np.full(60, 0.006)], leaves
 
 
 @cache

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scenes.bands import Ornament, Patch, Relief, Substance
-from scenes.noise import cellular_noise, smoothstep
+from scenes.noise import smoothstep
 from scenes.stencil import Stencil, polyline, repeat_grid, stroke_distance
 
 
@@ -51,16 +51,14 @@ def gadroons(count: int, turns: float, depth: float) -> Ornament:
 
 
 def flutes(count: int, turns: float, depth: float, arris: float, edge: Substance) -> Ornament:
-    """Concave channels with rounded ends; the ridges between (``arris`` of a repeat wide) are ``edge``."""
+    """Concave (parabolic) channels with rounded ends; the ridges between (``arris`` of a repeat wide) are ``edge``."""
 
     def relief(patch: Patch) -> Relief:
         f = _across(patch, count, turns) / (1 - arris)
         g = _end(patch, patch.girth / (2 * count) * 1.2)
         inside = 1 - f * f - g * g
         ridge = smoothstep(0.16, 0.04, inside)
-        return Relief(
-            (-depth * np.sqrt(np.clip(inside, 0, 1))).astype(np.float32), layers=((ridge.astype(np.float32), edge),)
-        )
+        return Relief((-depth * np.clip(inside, 0, 1)).astype(np.float32), layers=((ridge.astype(np.float32), edge),))
 
     return relief
 
@@ -155,18 +153,6 @@ def _meander_stencil() -> Stencil:
     scale = 1 / period
     curves = [polyline([((a - 2.0) * scale, (b - top / 2) * scale) for a, b in line]) for line in lines]
     return Stencil(stroke_distance(x, y, curves, [np.full(len(c), 0.31 * scale) for c in curves]))
-
-
-def hammered(size: float, depth: float) -> Ornament:
-    """Facets of a small hammer, ``size`` metres wide."""
-
-    def relief(patch: Patch) -> Relief:
-        cells = (max(6, round(patch.girth / size)), max(2, round(patch.length / size)))
-        first, _ = cellular_noise(patch.u, patch.t, cells, 7)
-        flat = np.zeros((len(patch.t), len(patch.u)), np.float32)
-        return Relief(flat, (depth * np.minimum(first, 0.9) ** 2 * _fade(patch, 0.05)).astype(np.float32))
-
-    return relief
 
 
 def _across(patch: Patch, count: int, turns: float = 0.0, shift: float = 0.0) -> NDArray:

@@ -16,7 +16,7 @@ from scenes.cloisonne import cloisonne
 from scenes.lathe import Piece, Profile, arc, curve, join, line, place, profile_sheet, tube, turn
 
 GOLD = Substance((0.94, 0.75, 0.40), 0.30, 1.0, tint=(0.84, 0.58, 0.26))
-COBALT = Substance((0.05, 0.15, 0.50), 0.20, tint=(0.04, 0.07, 0.30))
+COBALT = Substance((0.035, 0.11, 0.43), 0.20, tint=(0.02, 0.05, 0.24))
 TURQUOISE = Substance((0.08, 0.53, 0.54), 0.22, tint=(0.03, 0.36, 0.44))
 IVORY = Substance((0.91, 0.85, 0.71), 0.38, tint=(0.82, 0.72, 0.53), crackle=0.35)
 CORAL = Substance((0.76, 0.21, 0.13), 0.30, tint=(0.60, 0.12, 0.08))
@@ -117,7 +117,7 @@ def _body(density: float) -> tuple[Profile, Sheet]:
             curve((0.062, 0.508), (0.0545, 0.528), (0.053, 0.552), (0.060, 0.578)),
             IVORY,
             28,
-            o.flutes(26, 7.0, 0.0026, 0.14, GOLD),
+            o.flutes(18, 2.5, 0.0036, 0.20, GOLD),
         ),
         (arc((0.061, 0.579), (0.067, 0.593), 0.005), GOLD, 14, o.gadroons(36, 0, 0.0032)),
         (curve((0.068, 0.594), (0.071, 0.597), (0.071, 0.601)), GOLD, 4, None),
@@ -177,11 +177,11 @@ def _octagon(angle: NDArray) -> NDArray:
 def _handles(density: float, texture: int) -> Mesh:
     """Both handles: a twisted S from belly to rim with collars, and three scrolls that curl off it."""
     sheet = Sheet(
-        (Band(GOLD, max(24, round(240 * density)), o.rope(5, 16.0, 0.0022)),),
+        (Band(GOLD, max(24, round(240 * density)), o.rope(5, 16.0, 0.0034)),),
         np.array([0.0, 1.0]), np.array([0.055]), np.array([0.30]), 71,
     )  # fmt: skip
     scroll = Sheet(
-        (Band(GOLD, max(16, round(80 * density)), o.rope(4, 5.0, 0.0012)),),
+        (Band(GOLD, max(16, round(80 * density)), o.rope(4, 5.0, 0.0018)),),
         np.array([0.0, 1.0]), np.array([0.035]), np.array([0.14]), 73,
     )  # fmt: skip
     material = paint(sheet, texture // 4, texture, "handles")
