@@ -145,6 +145,8 @@ def grid_mesh(positions: NDArray, s: NDArray, material: Material, name: str) -> 
     flat = points.reshape(-1, 3)
     uu, vv = np.meshgrid(np.arange(columns + 1) / columns, 1 - s)
     uvs = np.stack([uu, vv], axis=-1).reshape(-1, 2).astype(np.float32)
+    used, faces = np.unique(faces, return_inverse=True)  # a fan leaves one vertex of its end row over
+    flat, uvs, faces = flat[used], uvs[used], faces.reshape(-1, 3).astype(np.int32)
     return Mesh(flat, faces, vertex_normals(flat, faces), uvs, material=material, name=name)
 
 

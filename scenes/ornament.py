@@ -76,7 +76,7 @@ def petals(count: int, depth: float, front: Substance, back: Substance, rim: Sub
             inside = (width - np.abs(f)) * half  # about metres from the leaf's edge
             pillow = np.clip(inside / half, 0, 1)
             rib = np.exp(-((f * half / 0.0016) ** 2)) * smoothstep(0.0, 0.004, inside)
-            leaf = depth * (lift * smoothstep(0, 0.0016, inside) + 0.75 * np.sqrt(pillow)) - 0.5 * depth * rib
+            leaf = depth * (lift * smoothstep(0, 0.0026, inside) + 0.75 * np.sqrt(pillow)) - 0.5 * depth * rib
             root = smoothstep(0.0, 0.06, patch.t)[:, None]
             mask = smoothstep(-0.0002, 0.0003, inside)
             height = np.where(inside > 0, np.maximum(height * 0.4, leaf * root), height).astype(np.float32)

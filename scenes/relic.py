@@ -239,7 +239,7 @@ def _jewels(profile: Profile, sheet: Sheet, density: float) -> list[Mesh]:
     for k in range(7):
         angle = 2 * np.pi * (k + 0.5) / 7
         around = np.array((np.sin(angle), 0.0, np.cos(angle)))
-        seat = 0.060 * around + np.array((0.0, 0.163, 0.0))
+        seat = 0.0625 * around + np.array((0.0, 0.163, 0.0))
         pearls.append(place(_gem(0.0060, 0.0058, PEARL, density), seat, around))
         settings.append(place(_setting(0.0064, 0.0016, density), seat, around))
     rubies.append(place(_gem(0.0125, 0.0125, RUBY, density), np.array((0.0, 0.758, 0.0)), np.array((0.0, 1.0, 0.0))))

@@ -65,7 +65,7 @@ def test_arrays_are_sound(assets: dict[str, Asset], name: str) -> None:
         assert mesh.positions.dtype == mesh.normals.dtype == mesh.uvs.dtype == np.float32
         assert mesh.faces.dtype == np.int32
         assert mesh.normals.shape == (count, 3) and mesh.uvs.shape == (count, 2)
-        assert mesh.faces.min() >= 0 and mesh.faces.max() < count
+        assert np.array_equal(np.unique(mesh.faces), np.arange(count))  # all referenced, none out of range
         assert np.isfinite(mesh.positions).all()
         assert mesh.uvs.min() >= 0 and mesh.uvs.max() <= 1
         assert np.abs(np.linalg.norm(mesh.normals, axis=1) - 1).max() < 1e-5
