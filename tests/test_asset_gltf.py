@@ -65,14 +65,18 @@ def test_round_trip_is_exact(tmp_path: Path, ball: Asset, suffix: str) -> None:
 def test_round_trip_of_random_triangles(tmp_path: Path, count: int, seed: int) -> None:
     rng = np.random.default_rng(seed)
     positions = rng.normal(size=(3 * count, 3)).astype(np.float32)
-    mesh = Mesh(positions, np.arange(3 * count, dtype=np.int32).reshape(-1, 3), material=Material(base_color=(0.2, 0.4, 0.6)))
+    mesh = Mesh(
+        positions, np.arange(3 * count, dtype=np.int32).reshape(-1, 3), material=Material(base_color=(0.2, 0.4, 0.6))
+    )
     save(Asset((mesh,)), tmp_path / "x.glb")
     again = load(tmp_path / "x.glb").meshes[0]
     np.testing.assert_array_equal(again.positions[again.faces], positions.reshape(-1, 3, 3))
     assert again.material.base_color == pytest.approx((0.2, 0.4, 0.6))
 
 
-@settings(max_examples=120, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(
+    max_examples=120, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
 @given(cut=st.integers(0, 2000), flips=st.lists(st.tuples(st.integers(0, 5000), st.integers(1, 255)), max_size=4))
 def test_damaged_files_are_refused_or_read(tmp_path: Path, cut: int, flips: list[tuple[int, int]]) -> None:
     document, binary = triangle_document()
@@ -89,7 +93,9 @@ def test_damaged_files_are_refused_or_read(tmp_path: Path, cut: int, flips: list
 
 
 def test_node_transforms_and_mirroring(tmp_path: Path) -> None:
-    document, binary = triangle_document(nodes=[{"children": [1], "scale": [-2, 1, 1]}, {"mesh": 0, "translation": [1, 0, 0]}])
+    document, binary = triangle_document(
+        nodes=[{"children": [1], "scale": [-2, 1, 1]}, {"mesh": 0, "translation": [1, 0, 0]}]
+    )
     write_glb(tmp_path / "x.glb", document, binary)
     mesh = load(tmp_path / "x.glb").meshes[0]
     p = mesh.positions[mesh.faces[0]]
@@ -158,13 +164,26 @@ def test_output_passes_the_khronos_validator(tmp_path: Path, ball: Asset) -> Non
         pytest.skip("node with the package gltf-validator is not there")
     mesh = ball.meshes[0]
     index, faces, tangents = split_and_tangents(mesh.positions, mesh.normals, mesh.uvs, mesh.faces)
-    full = replace(mesh, positions=mesh.positions[index], normals=mesh.normals[index], uvs=mesh.uvs[index], faces=faces, tangents=tangents)
+    full = replace(
+        mesh,
+        positions=mesh.positions[index],
+        normals=mesh.normals[index],
+        uvs=mesh.uvs[index],
+        faces=faces,
+        tangents=tangents,
+    )
     save(Asset((full,)), tmp_path / "x.glb")
     script = (
         "require('gltf-validator').validateBytes(new Uint8Array(require('fs').readFileSync(process.argv[1])))"
         ".then(r => console.log(JSON.stringify(r.issues)))"
     )
-    out = subprocess.run([node, "-e", script, str(tmp_path / "x.glb")], capture_output=True, text=True, check=True, cwd=Path(__file__).parents[1])
+    out = subprocess.run(
+        [node, "-e", script, str(tmp_path / "x.glb")],
+        capture_output=True,
+        text=True,
+        check=True,
+        cwd=Path(__file__).parents[1],
+    )
     issues = json.loads(out.stdout)
     assert issues["numErrors"] == 0, issues["messages"][:3]
 

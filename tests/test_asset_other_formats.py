@@ -159,7 +159,9 @@ def test_usd_output_passes_usd_validation(tmp_path: Path, ball: Asset) -> None:
     assert not errors, [e.GetMessage() for e in errors]
 
 
-def test_nothing_is_left_behind_when_writing_fails(tmp_path: Path, ball: Asset, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nothing_is_left_behind_when_writing_fails(
+    tmp_path: Path, ball: Asset, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (tmp_path / "x.glb").write_bytes(b"old")
 
     def full(*_: object) -> None:

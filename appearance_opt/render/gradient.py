@@ -178,7 +178,7 @@ def _contrast(
     alpha = dr.select(covered, mi.Float(1), 0)
     dr.eval(color, alpha)
     n = dr.width(edges.edge)
-    inner, outer = dr.arange(mi.UInt32, n), dr.arange(mi.UInt32, n) + n
+    inner, outer = dr.arange(mi.UInt32, n), dr.arange(mi.UInt32, n) + dr.opaque(mi.UInt32, n)
     return mi.ArrayXf(
         [dr.gather(mi.Float, c, inner) - dr.gather(mi.Float, c, outer) for c in (color.x, color.y, color.z, alpha)]
     )

@@ -1,0 +1,105 @@
+"""The command line, options, doctor."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import appearance_opt
+from appearance_opt import config
+from appearance_opt.asset import save
+from appearance_opt.asset.types import Asset
+from appearance_opt.errors import InputError
+
+
+def run(*arguments: str, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "appearance_opt", *arguments]
+    return subprocess.run(command, capture_output=True, text=True, cwd=cwd, timeout=300)
+
+
+def test_simplify_and_compare_as_a_user_would(ball: Asset, tmp_path: Path) -> None:
+    save(ball, tmp_path / "ball.glb")
+    (tmp_path / "job.toml").write_text('texture-size = 64\nresolution = 48\npool = 8\nsteps = 4\nbudget = "2m"\n')
+    done = run("simplify", "ball.glb", "--triangles", "150", "--out", "low.glb", "--config", "job.toml", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "of 2208 triangles" in done.stdout
+    assert (tmp_path / "low.report" / "report.html").is_file()
+    assert json.loads((tmp_path / "low.report" / "report.json").read_text())["metrics"]["result"]["psnr_covered"] > 20
+    done = run("compare", "ball.glb", "low.glb", "--json", "--views", "2", "--resolution", "64", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)["psnr"] > 20
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["simplify", "absent.glb", "--triangles", "10", "--out", "x.glb"], "absent.glb: no such file"),
+        (["simplify", "ball.glb", "--triangles", "0", "--out", "x.glb"], "at least 4"),
+        (["simplify", "ball.glb", "--out", "x.glb"], "--triangles N or --ratio R"),
+        (["simplify", "ball.glb", "--triangles", "99999", "--out", "x.glb"], "has only 2208 triangles"),
+        (["simplify", "ball.glb", "--triangles", "10", "--out", "ball.glb"], "is the input itself"),
+        (["simplify", "ball.glb", "--triangles", "10", "--out", "x.fbx"], "cannot write '.fbx'"),
+        (["simplify", "ball.glb", "--triangles", "10", "--out", "ball.glb/x.glb"], "not a folder"),
+        (["simplify", "ball.glb", "--triangles", "ten", "--out", "x.glb"], "valid integer"),
+        (["simplify", "ball.glb", "--triangles", "10", "--out", "x.glb", "--fit", "shap"], "did you mean 'shape'"),
+        (["simplify", "ball.glb", "--triangles", "10", "--out", "x.glb", "--budget", "soon"], "not a time"),
+        (["simplify", "ball.glb", "--triangles", "10", "--out", "x.glb", "--config", "bad.toml"], "did you mean"),
+        (["simplify", "ball.glb", "--triangles", "10", "--out", "x.glb", "--resume"], "--checkpoint"),
+        (["compare", "ball.glb", "empty.glb"], "empty"),
+        (["nonsense"], "nonsense"),
+    ],
+)
+def test_mistakes_end_in_one_line_and_code_2(ball: Asset, tmp_path: Path, arguments: list[str], words: str) -> None:
+    save(ball, tmp_path / "ball.glb")
+    before = (tmp_path / "ball.glb").read_bytes()
+    (tmp_path / "empty.glb").write_bytes(b"")
+    (tmp_path / "bad.toml").write_text("triangel = 5\n")
+    names = {p.name for p in tmp_path.iterdir()}
+    done = run(*arguments, cwd=tmp_path)
+    assert done.returncode == 2, done.stderr
+    assert done.stderr.startswith("error: ") and done.stderr.count("\n") == 1
+    assert words in done.stderr
+    assert {p.name for p in tmp_path.iterdir()} == names
+    assert (tmp_path / "ball.glb").read_bytes() == before
+
+
+def test_doctor_and_version() -> None:
+    done = run("doctor", "--json")
+    assert done.returncode == 0
+    assert json.loads(done.stdout)["problem"] == ""
+    assert appearance_opt.__version__ in run("--version").stdout
+
+
+def test_help_imports_nothing_heavy() -> None:
+    code = (
+        "import sys, appearance_opt.cli;"
+        "print([m for m in ('drjit', 'mitsuba', 'pxr', 'OpenImageIO', 'scipy', 'numpy') if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_public_names_exist() -> None:
+    for name in appearance_opt.__all__:
+        assert getattr(appearance_opt, name) is not None
+    assert set(appearance_opt._HOMES) == set(appearance_opt.__all__)
+    with pytest.raises(AttributeError):
+        _ = appearance_opt.nonsense
+
+
+def test_presets_files_and_overrides(tmp_path: Path) -> None:
+    options = config.simplify_options("draft", ratio=0.1, budget="1.5m", fit="shape, normal")
+    assert (options.budget, options.fit, options.resolution) == (90.0, ("shape", "normal"), 192)
+    assert config.simplify_options("draft", ratio=0.1, steps=5).budget is None
+    (tmp_path / "a.toml").write_text("texture-size = 512\nrelative = false\n")
+    assert config.read_toml(tmp_path / "a.toml") == {"texture_size": 512, "relative": False}
+    with pytest.raises(InputError, match="did you mean 'texture-size'"):
+        config.simplify_options(triangles=5, texture_sise=3)
+    with pytest.raises(InputError, match="expected"):
+        config.simplify_options(triangles="5")
+    with pytest.raises(InputError, match="power of two"):
+        config.simplify_options(triangles=5, texture_size=100)
