@@ -49,7 +49,7 @@ class FitOptions:
     decay: float = 1.5
     background: Background = "random"
     quality: Quality = field(default_factory=Quality)
-    validate_every: float = 0.1
+    validate_every: float = 0.125
     seed: int = 0
 
 

@@ -23,7 +23,7 @@ BACKGROUND = 0.18
 class Validation:
     """Fixed views that the fit never sees, and the score of a model on them."""
 
-    def __init__(self, reference: Reference, views: Views, resolution: int, samples: int = 4) -> None:
+    def __init__(self, reference: Reference, views: Views, resolution: int, samples: int = 9) -> None:
         self.views, self.resolution, self.samples = views, resolution, samples
         self._grid = Grid(len(views), resolution)
         images = checked(reference.render(views, resolution, samples), "held-out views")

@@ -143,7 +143,7 @@ def _camera_samples(
     if not parts_weights:
         return None, None, None
     samples = _concat([p for p, _ in parts_weights])
-    weight = dr.concat([dr.full(mi.Float, w, dr.width(p.triangle)) for p, w in parts_weights])
+    weight = _joined([dr.full(mi.Float, w, dr.width(p.triangle)) for p, w in parts_weights])
     dr.eval(samples, weight)
     return samples, pixel_index(samples, grid.rows), weight
 
@@ -164,7 +164,19 @@ def _fine_samples(scene: mi.Scene, records: mi.Float, grid: Grid, index: mi.UInt
 def _concat(parts: list[Samples]) -> Samples:
     if len(parts) == 1:
         return parts[0]
-    return Samples(*(dr.concat([getattr(p, f) for p in parts]) for f in ("view", "x", "y", "triangle")))
+    return Samples(*(_joined([getattr(p, f) for p in parts]) for f in ("view", "x", "y", "triangle")))
+
+
+def _joined(parts: list[mi.Float]) -> mi.Float:
+    """Arrays one after the other. ``dr.concat`` would write their widths, which change every step, into the
+    kernel and so compile one every step."""
+    out = dr.empty(type(parts[0]), sum(dr.width(p) for p in parts))
+    offset = 0
+    for part in parts:
+        index = dr.arange(mi.UInt32, dr.width(part)) + dr.opaque(mi.UInt32, offset)
+        dr.scatter(out, part, index, mode=dr.ReduceMode.Permute)
+        offset += dr.width(part)
+    return out
 
 
 def _contrast(

@@ -1,0 +1,212 @@
+"""Time of one step, by size and by stage, on an embedded scene.
+
+    python -m experiments.bench [--quick]
+
+Prints Markdown tables for docs/performance.md and writes out/bench.json. Medians and ranges over steps after warm-up;
+compare ratios within one run, not times between machines.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import platform
+import resource
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+
+from appearance_opt import backend
+
+OUT = Path("out")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--quick", action="store_true", help="fewer sizes and repetitions")
+    parser.add_argument("--case", help="run one case in this process and print its JSON")
+    a = parser.parse_args()
+    found = backend.select("cpu")
+    if a.case:
+        print(json.dumps(run_case(**json.loads(a.case))))
+        return
+    print(f"{platform.processor() or platform.machine()}, {found.threads} threads, LLVM {found.llvm}\n")
+    rows = {name: in_process(case) for name, case in cases(a.quick).items()}
+    print(table(rows))
+    print(growth(rows))
+    if not a.quick:
+        rows["direct_projective"] = {"milliseconds": projective(rows)}
+    OUT.mkdir(exist_ok=True)
+    (OUT / "bench.json").write_text(json.dumps(rows, indent=1))
+
+
+def cases(quick: bool) -> dict[str, dict]:
+    """Sizes to time: resolution of 4 views, triangles of latent and reference, map size, live reference."""
+    base = {"resolution": 256, "latent": 3000, "reference": 100_000, "maps": 512, "live": False}
+    out = {"256": base, "256 live reference": {**base, "live": True}, "128": {**base, "resolution": 128}}
+    out["512, 1024 maps"] = {**base, "resolution": 512, "maps": 1024}
+    if quick:
+        return out
+    out["512"] = {**base, "resolution": 512}
+    out["1024"] = {**base, "resolution": 1024}
+    out["50k latent"] = {**base, "latent": 50_000}
+    out["10k reference, live"] = {**base, "live": True, "reference": 10_000}
+    out["1M reference, live"] = {**base, "live": True, "reference": 1_000_000}
+    return out
+
+
+def in_process(case: dict) -> dict:
+    """Each case in a process of its own: its peak memory is its own."""
+    command = [sys.executable, "-m", "experiments.bench", "--case", json.dumps(case)]
+    return json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout.splitlines()[-1])
+
+
+def run_case(resolution: int, latent: int, reference: int, maps: int, live: bool, steps: int = 25) -> dict:
+    """Median and range in ms of a whole step, the sum of its kernels, kernels compiled, peak memory."""
+    import drjit as dr
+
+    from appearance_opt.fit import adam
+    from appearance_opt.fit.laplacian import Laplacian
+    from appearance_opt.fit.losses import LOSSES
+    from appearance_opt.fit.step import StepInputs, first_non_finite, step
+    from appearance_opt.render.deferred import Grid
+    from appearance_opt.render.gradient import Quality
+
+    source, model, sampler = set_up(latent, reference, maps)
+    grid = Grid(4, resolution)
+    mesh = model.topology.mesh
+    laplacian = Laplacian(mesh.positions, mesh.faces, model.edge_length, relative=True)
+    moments = {n: adam.moments_of(p) for n, p in model.parameters.items()}
+    views = [sampler.draw(k, 4) for k in range(8)]
+    images = [source.render_device(v.records(), grid, 1) for v in views]
+
+    def one(k: int) -> None:
+        v, image = views[k % 8], images[k % 8]
+        if live:
+            image = source.render_device(v.records(), grid, 1)
+        background = np.full((4, 3), 0.3, np.float32)
+        inputs = StepInputs(v, image, background, 0.01, 1.0, k)
+        step(model, moments, grid, Quality(1.0, 4, 1), LOSSES["log-srgb-l1"], laplacian, inputs, first_non_finite)
+
+    for k in range(10):
+        one(k)
+    walls, kernels, compiled = [], [], 0
+    for k in range(steps):
+        dr.sync_thread()
+        began = time.perf_counter()
+        one(k)
+        dr.sync_thread()
+        walls.append(1e3 * (time.perf_counter() - began))
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        for k in range(5):
+            dr.kernel_history_clear()
+            one(k)
+            dr.sync_thread()
+            history = dr.kernel_history()
+            kernels.append(sum(h.get("execution_time", 0.0) for h in history))
+            compiled += sum(h["type"] == dr.KernelType.JIT and not h["cache_hit"] for h in history)
+    return {
+        "milliseconds": float(np.median(walls)),
+        "range": [float(min(walls)), float(max(walls))],
+        "kernels": float(np.median(kernels)),
+        "compiled": int(compiled),
+        "peak_gib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20,
+        "triangles": len(mesh.faces),
+    }
+
+
+def set_up(latent: int, reference: int, maps: int):
+    """A bumpy sphere, and a smooth coarse one with random maps as its latent."""
+    from appearance_opt.fit.model import Model, Rates
+    from appearance_opt.initial.sphere import random_maps, sphere
+    from appearance_opt.jobs.simplify import in_frame
+    from appearance_opt.reference.mesh import MeshReference
+    from appearance_opt.views import ViewSampler, framing
+    from scenes.analytic import bumpy_sphere
+
+    asset = bumpy_sphere(reference)
+    frame = framing(np.concatenate([m.positions for m in asset.meshes]))
+    source = MeshReference(in_frame(asset, *frame))
+    mesh = sphere(latent, (0.0, 0.0, 0.0), 0.93, maps)
+    model = Model(mesh, random_maps(maps, 0, True), frozenset(("shape", "normal", "material")), Rates())
+    return source, model, ViewSampler((0.0, 0.0, 0.0), 1.0)
+
+
+def projective(rows: dict) -> float:
+    """Milliseconds of Mitsuba's ``direct_projective`` at 16 samples per pixel for the vertex gradient of one
+    4 x 256^2 batch of a diffuse mesh of the same size: the gradient alone."""
+    import drjit as dr
+    import mitsuba as mi
+
+    from appearance_opt.initial.sphere import sphere
+
+    low = sphere(3000, (0.0, 0.0, 0.0), 0.93, 64)
+    mesh = mi.Mesh("m", len(low.positions), len(low.faces))
+    p = mi.traverse(mesh)
+    p["vertex_positions"], p["faces"] = mi.Float(low.positions.ravel()), mi.UInt32(low.faces.astype(np.uint32).ravel())
+    p.update()
+    light = {"type": "point", "position": [2, 3, 5], "intensity": {"type": "rgb", "value": 40.0}}
+    scene = mi.load_dict({"type": "scene", "mesh": mesh, "light": light})
+    sensor = mi.load_dict(
+        {
+            "type": "perspective",
+            "fov": 32.0,
+            "to_world": mi.ScalarTransform4f().look_at([0, 0, 4], [0, 0, 0], [0, 1, 0]),
+            "film": {"type": "hdrfilm", "width": 256, "height": 256},
+        }
+    )
+    integrator = mi.load_dict({"type": "direct_projective"})
+    parameters = mi.traverse(scene)
+    key = next(k for k in parameters.keys() if k.endswith("vertex_positions"))  # noqa: SIM118
+    times = []
+    for k in range(5):
+        dr.enable_grad(parameters[key])
+        parameters.update()
+        dr.sync_thread()
+        began = time.perf_counter()
+        for view in range(4):
+            image = mi.render(scene, parameters, sensor=sensor, integrator=integrator, spp=16, seed=4 * k + view)
+            dr.backward(dr.mean(dr.square(image), axis=None))
+        dr.eval(dr.grad(parameters[key]))
+        dr.sync_thread()
+        times.append(1e3 * (time.perf_counter() - began))
+    value = float(np.median(times[1:]))
+    print(f"\ndirect_projective, 16 spp, gradient alone, 4 x 256^2: {value:.0f} ms; ", end="")
+    print(f"{value / rows['256']['milliseconds']:.0f} x a whole step of ours")
+    return value
+
+
+def table(rows: dict) -> str:
+    """Markdown table of all cases."""
+    lines = [
+        "| case (4 views) | ms per step, median (range) | kernels | wall / kernels | compiled | peak GiB |",
+        "|---|---|---|---|---|---|",
+    ]
+    for name, r in rows.items():
+        low, high = r["range"]
+        lines.append(
+            f"| {name} | {r['milliseconds']:.1f} ({low:.1f} to {high:.1f}) | {r['kernels']:.1f} | "
+            f"{r['milliseconds'] / r['kernels']:.2f} | {r['compiled']} | {r['peak_gib']:.2f} |"
+        )
+    return "\n".join(lines)
+
+
+def growth(rows: dict) -> str:
+    """Ratios that the sizes of a job decide."""
+    t = {name: r["milliseconds"] for name, r in rows.items()}
+    out = []
+    if "1024" in t:
+        exponent = np.polyfit(
+            np.log([128**2, 256**2, 512**2, 1024**2]), np.log([t[k] for k in ("128", "256", "512", "1024")]), 1
+        )[0]
+        out.append(f"exponent of time in pixels, 128^2 to 1024^2: {exponent:.2f}")
+        out.append(f"50k latent over 3k: {t['50k latent'] / t['256']:.2f}")
+        out.append(f"1M reference over 10k, rendered live: {t['1M reference, live'] / t['10k reference, live']:.2f}")
+    return "\n" + "\n".join(out)
+
+
+if __name__ == "__main__":
+    main()
