@@ -3,8 +3,7 @@
 The metric is Garland and Heckbert's, with faces weighted by area times an importance that the caller
 gives: how much of the face an observer sees. Instead of one collapse at a time, each round collapses all
 cheap edges that are the cheapest of their neighbourhood; their neighbourhoods do not touch, so a round is a
-handful of array operations. No library that we tried lets importance into the metric, and their
-thresholds depend on the scale of the input (see ``experiments/decimation``).
+handful of array operations. What libraries do instead, and why it was not enough, is in docs/design.md.
 """
 
 from __future__ import annotations
