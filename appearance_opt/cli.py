@@ -162,6 +162,33 @@ def compare(
 
 
 @app.command()
+def inspect(
+    source: Annotated[Path, typer.Argument(metavar="INPUT", help=".glb .gltf .usd* .obj .ply .stl")],
+    as_json: Annotated[bool, typer.Option("--json", help="Print as JSON.")] = False,
+    subdivision: Annotated[int, typer.Option(help="Level of USD subdivision surfaces.")] = 1,
+    variant: Annotated[list[str] | None, typer.Option(help="USD variant: set=name (repeatable).")] = None,
+) -> None:
+    """Say what is in an asset and what is wrong with it."""
+    from dataclasses import asdict
+
+    from appearance_opt.asset import load
+    from appearance_opt.asset.validate import validate
+
+    asset = load(source, subdivision=subdivision, variants=_variants(variant))
+    found = {"meshes": len(asset.meshes), **asdict(validate(asset)), "notes": list(asset.notes)}
+    if as_json:
+        import json
+
+        print(json.dumps(found, indent=1))
+        return
+    for name, value in found.items():
+        if name != "notes":
+            print(f"{name.replace('_', ' '):22} {value}")
+    for note in asset.notes:
+        print(f"note: {note}")
+
+
+@app.command()
 def doctor(as_json: Annotated[bool, typer.Option("--json", help="Print as JSON.")] = False) -> None:
     """Say what this machine offers, and what to install when something is missing."""
     from appearance_opt.doctor import diagnose

@@ -67,6 +67,15 @@ def test_mistakes_end_in_one_line_and_code_2(ball: Asset, tmp_path: Path, argume
     assert (tmp_path / "ball.glb").read_bytes() == before
 
 
+def test_inspect_counts_what_is_wrong(tmp_path: Path) -> None:
+    (tmp_path / "x.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 5 5 5\nf 1 2 3\nf 1 1 2\n")
+    done = run("inspect", "x.obj", "--json", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout)
+    assert (found["triangles"], found["boundary_edges"], found["meshes_without_uvs"]) == (1, 3, 1)
+    assert any("1 degenerate" in n for n in found["notes"])
+
+
 def test_doctor_and_version() -> None:
     done = run("doctor", "--json")
     assert done.returncode == 0

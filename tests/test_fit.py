@@ -118,6 +118,15 @@ def test_broken_checkpoints_are_refused(ball: Asset, tmp_path: Path) -> None:
         fit(model, pool, validation, FitOptions(steps=1), None, Checkpointer(tmp_path, "x", True))
 
 
+def test_a_diverged_job_writes_its_best_state_first(
+    ball: Asset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(loop, "first_non_finite", lambda grads: "texels")
+    with pytest.raises(DivergedError, match="texels"):
+        simplify(ball, tmp_path / "x.glb", options(steps=50))
+    assert 0 < load(tmp_path / "x.glb").triangle_count <= 200
+
+
 def test_repeated_bad_gradients_stop_the_fit(ball: Asset, monkeypatch: pytest.MonkeyPatch) -> None:
     model, pool, validation = make_fit(ball)
     start = model.host_positions()

@@ -15,7 +15,7 @@ import numpy as np
 from appearance_opt import backend
 from appearance_opt.asset import check_writable, load, save
 from appearance_opt.config import SimplifyOptions, as_dict
-from appearance_opt.errors import InputError
+from appearance_opt.errors import DivergedError, InputError
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -45,7 +45,8 @@ REPORT_SECONDS = 5.0
 @dataclass
 class SimplifyResult:
     """What ``simplify`` did. ``asset``: the result; ``start``: the same before the fit; ``fit``: curve and
-    counts; ``seconds``: wall-clock time by stage; ``notes``: what the user should know."""
+    counts; ``seconds``: wall-clock time by stage; ``notes``: what the user should know; ``error``: set when the fit
+    diverged (``simplify`` raises it after writing the best state)."""
 
     asset: Asset
     start: Asset
@@ -54,6 +55,7 @@ class SimplifyResult:
     source_triangles: int
     seconds: dict[str, float] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
+    error: DivergedError | None = None
 
 
 class Stopwatch:
@@ -102,8 +104,12 @@ def simplify(
     if out is not None:
         save(result.asset, out)
         watch.lap("write")
+    if result.error is not None:
+        raise result.error
     if report is not None:
         from appearance_opt.jobs.report import write_simplify_report
+
+        result.seconds = dict(watch.stages)
 
         write_simplify_report(Path(report), asset, result, run.sampler, run.frame, options)
         watch.lap("report")
@@ -147,7 +153,7 @@ class _Job:
         watch.lap("start")
 
     def fit(self, progress: Progress | None, checkpointer, with_report: bool) -> SimplifyResult:
-        from appearance_opt.fit.loop import FitOptions, fit
+        from appearance_opt.fit.loop import FitOptions, FitResult, fit
         from appearance_opt.fit.model import Model, Rates
         from appearance_opt.fit.validation import Validation
         from appearance_opt.latent.export import to_asset
@@ -178,7 +184,11 @@ class _Job:
             quality=quality,
             seed=o.seed,
         )
-        fitted = fit(model, pool, validation, fit_options, progress, checkpointer)
+        error = None
+        try:
+            fitted = fit(model, pool, validation, fit_options, progress, checkpointer)
+        except DivergedError as diverged:  # the model holds the best state, which is written before this is told
+            error, fitted = diverged, FitResult()
         self.watch.lap("fit")
         centre, scale = np.array(self.frame[0]), self.frame[1]
 
@@ -195,7 +205,9 @@ class _Job:
             notes.append(f"{fitted.skipped} steps with non-finite gradients were skipped")
         if fitted.interrupted:
             notes.append(f"interrupted after {fitted.steps} steps: this is the best state so far")
-        return SimplifyResult(result, begin, fitted, len(self.start.mesh.faces), self.asset.triangle_count, notes=notes)
+        return SimplifyResult(
+            result, begin, fitted, len(self.start.mesh.faces), self.asset.triangle_count, notes=notes, error=error
+        )
 
 
 def effort(psnr: float, likeness: bool) -> tuple[Quality, Rates]:

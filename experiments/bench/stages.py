@@ -1,0 +1,100 @@
+"""Where the time of a step goes: every stage alone, the device idle before and after it.
+
+    python -m experiments.bench.stages
+
+The stages add up to more than a step: a step overlaps Python with the kernels of the stage before.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from appearance_opt import backend
+from appearance_opt.fit import adam
+from appearance_opt.fit.losses import LOSSES, image_loss
+from appearance_opt.fit.model import POSITIONS, TEXELS
+from appearance_opt.render import gradient
+from appearance_opt.render.deferred import Grid
+from appearance_opt.render.gradient import Quality
+from experiments.bench.__main__ import set_up
+
+REPEATS = 15
+
+
+def main() -> None:
+    backend.select("cpu")
+    print("| stage | 4 x 256^2, 512^2 maps (ms) | 4 x 512^2, 1024^2 maps (ms) |\n|---|---|---|")
+    small, large = stages(256, 512), stages(512, 1024)
+    for name, value in small.items():
+        print(f"| {name} | {value:.1f} | {large[name]:.1f} |")
+
+
+def stages(resolution: int, maps: int) -> dict[str, float]:
+    """Median milliseconds of each stage."""
+    source, model, sampler = set_up(3000, 100_000, maps)
+    grid, quality = Grid(4, resolution), Quality(1.0, 4, 1)
+    records = sampler.draw(0, 4).records()
+    reference = source.render_device(records, grid, 1)
+    edges = model.topology.edges
+    out: dict[str, float] = {}
+
+    def timed(name: str, work: Callable[[], object]) -> object:
+        times = []
+        for _ in range(REPEATS):
+            dr.sync_thread()
+            began = time.perf_counter()
+            result = work()
+            dr.eval(result)
+            dr.sync_thread()
+            times.append(1e3 * (time.perf_counter() - began))
+        out[name] = float(np.median(times[3:]))
+        return result
+
+    timed("reference image, rendered live, 1 sample", lambda: source.render_device(records, grid, 1))
+    timed("BVH of the latent", model.update_scene)
+    timed("texels to mip pyramid", lambda: model.fitted_layer().pyramid.texels)
+    positions = mi.Float(model.positions())
+    dr.enable_grad(positions)
+    timed("normals and tangent frames", lambda: model.surface(positions).vertices)
+    surface, layer = model.surface(positions), model.fitted_layer()
+    dr.enable_grad(layer.pyramid.texels)
+    scene, all_maps = model.scene, model.maps(layer)
+    none = Quality(0.0, 1, 1)
+    timed(
+        "forward without edges", lambda: gradient.render(scene, surface, all_maps, edges, records, grid, none, 0).image
+    )
+    timed(
+        "forward with edges", lambda: gradient.render(scene, surface, all_maps, edges, records, grid, quality, 0).image
+    )
+    frame = gradient.render(scene, surface, all_maps, edges, records, grid, quality, 0)
+    background = mi.Float(np.full(16, 0.3, np.float32))
+    loss = LOSSES["log-srgb-l1"]
+    timed("loss and its gradient", lambda: image_loss(loss, frame.image, reference, background, resolution**2))
+    _, by_image = image_loss(loss, frame.image, reference, background, resolution**2)
+
+    def backward() -> tuple:
+        p = mi.Float(model.positions())
+        dr.enable_grad(p)
+        texels = mi.Float(dr.detach(layer.pyramid.texels))
+        dr.enable_grad(texels)
+        fresh = model.maps(layer.with_texels(texels))
+        dr.backward(gradient.surrogate(frame, model.surface(p), fresh, edges, by_image, quality))
+        return dr.grad(p), dr.grad(texels)
+
+    grads = timed("backward (normals and frames included)", backward)
+    parameter = model.parameters[TEXELS]
+    timed("pyramid gradient to texels", lambda: model.codec.pull_back(grads[1], parameter.value))
+    down = model.codec.pull_back(grads[1], parameter.value)
+    moments = {n: adam.moments_of(p) for n, p in model.parameters.items()}
+    timed("Adam, texels", lambda: adam.update(parameter, down, moments[TEXELS], 1.0)[0])
+    timed("Adam, positions", lambda: adam.update(model.parameters[POSITIONS], grads[0], moments[POSITIONS], 1.0)[0])
+    return out
+
+
+if __name__ == "__main__":
+    main()
