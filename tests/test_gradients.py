@@ -112,7 +112,7 @@ def coverage_derivative(density: float, samples: int) -> tuple[float, float]:
     frame = gradient.render(model.scene, surface, maps, model.topology.edges, records, grid, quality, 0)
     by_image = np.zeros((grid.pixels, 4), np.float32)
     by_image[:, 3] = 1
-    dr.backward(gradient.surrogate(frame, surface, maps, model.topology.edges, mi.Float(by_image.ravel()), quality))
+    gradient.backward(gradient.surrogate(frame, surface, maps, model.topology.edges, mi.Float(by_image.ravel())))
     edge = float(np.array(dr.grad(positions)).astype(np.float64) @ start)
     areas = []
     for scale in (1.02, 0.98):

@@ -39,8 +39,12 @@ class Laplacian:
 
     def __call__(self, positions: mi.Float) -> mi.Float:
         """The regularizer at flat positions (3 V); width 1, differentiable."""
+        return dr.sum(self.per_vertex(positions))
+
+    def per_vertex(self, positions: mi.Float) -> mi.Float:
+        """Share of each vertex in the regularizer (V)."""
         offset = (self._delta(positions) - self._initial) * self._scale
-        return dr.sum(dr.squared_norm(offset)) / self._count
+        return dr.squared_norm(offset) / self._count
 
     def _delta(self, positions: mi.Float) -> mi.Vector3f:
         total = dr.zeros(mi.Float, 3 * self._count)

@@ -30,6 +30,9 @@ log = logging.getLogger(__name__)
 MAX_BAD_STEPS = 10
 """Consecutive steps with non-finite gradients after which a fit gives up."""
 
+LOSS_EVERY = 8
+"""Steps between two evaluations of the loss: it is only shown, the gradient does not need it."""
+
 Background = str | tuple[float, float, float]
 """random, black, white, grey, or linear RGB."""
 
@@ -150,12 +153,13 @@ class _Run:
             laplacian_weight=laplacian_weight(state.laplacian, fraction),
             rate=learning_rate(fraction, options.decay),
             seed=state.iteration,
+            want_loss=state.iteration % LOSS_EVERY == 0 or state.laplacian == 0,
         )
         done = step(
             self.model, state.moments, self.grid, options.quality, self.loss, self.laplacian, inputs, first_non_finite
         )
         self._count(done.bad)
-        if done.bad is None:
+        if done.bad is None and done.loss is not None:
             state.loss = done.loss
             if state.laplacian == 0 and self.laplacian is not None:
                 # a deviation of a tenth of an edge length costs this fraction of the first image loss

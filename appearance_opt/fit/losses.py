@@ -82,20 +82,38 @@ def loss_of_name(name: str) -> Loss:
     return LOSSES[name]
 
 
+def covered_loss(
+    loss: Loss, color: mi.Color3f, pixel: mi.UInt32, reference: mi.Float, background: mi.Float, pixels_per_view: int | mi.UInt32
+) -> mi.Float:
+    """Share of the mean loss of a batch that falls on fully covered pixels of radiance ``color``, one value per
+    pixel, differentiable. The other arguments as for ``image_loss``."""
+    count = dr.width(pixel)
+    behind = dr.gather(mi.ArrayXf, background, pixel // pixels_per_view, shape=(4, count))
+    target = dr.gather(mi.ArrayXf, reference, pixel, shape=(4, count))
+    per_pixel = loss(color, _over(target, mi.Color3f(behind[0], behind[1], behind[2])))
+    scale = dr.opaque(mi.Float, 4 / (3 * dr.width(reference)))
+    return (per_pixel.x + per_pixel.y + per_pixel.z) * scale
+
+
 def image_loss(
-    loss: Loss, image: mi.Float, reference: mi.Float, background: mi.Float, pixels_per_view: int
+    loss: Loss,
+    image: mi.Float,
+    reference: mi.Float,
+    background: mi.Float,
+    pixels_per_view: int | mi.UInt32,
+    complete: mi.Bool | None = None,
 ) -> tuple[mi.Float, mi.Float]:
     """Mean loss over a batch, and its derivative by the image.
 
     ``image``, ``reference``: (pixels * 4) premultiplied linear RGB and coverage. ``background``:
-    (views * 4) linear RGB and padding, the colour behind each view. Returns (width-1 loss, gradient as
-    wide as ``image``).
+    (views * 4) linear RGB and padding, the colour behind each view. ``complete``: (pixels,) pixels to look at
+    (all). Returns (width-1 loss, gradient as wide as ``image``).
     """
     total = dr.width(image) // 4
     i = dr.arange(mi.UInt32, total)
     # where neither image is covered both show the background: no loss, no gradient, no work
     either = (dr.gather(mi.Float, image, 4 * i + 3) > 0) | (dr.gather(mi.Float, reference, 4 * i + 3) > 0)
-    i = dr.compress(either)
+    i = dr.compress(either if complete is None else either & complete)
     count = dr.width(i)
     gradient = dr.zeros(mi.Float, total * 4)
     if count == 0:

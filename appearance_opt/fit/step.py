@@ -10,7 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 from appearance_opt.fit import adam
-from appearance_opt.fit.losses import image_loss
+from appearance_opt.fit.losses import covered_loss, image_loss
 from appearance_opt.fit.model import POSITIONS, TEXELS, Model
 from appearance_opt.render import gradient
 
@@ -27,7 +27,8 @@ if TYPE_CHECKING:
 @dataclass(frozen=True)
 class StepInputs:
     """What a step sees: ``views`` and their ``reference`` images (flat, on the device), the
-    ``background`` behind each view (B, 3) linear, and the current weights and rate."""
+    ``background`` behind each view (B, 3) linear, and the current weights and rate. ``want_loss``: the gradient
+    does not need the value of the loss; evaluating it shades all samples once more."""
 
     views: Views
     reference: mi.Float
@@ -35,21 +36,22 @@ class StepInputs:
     laplacian_weight: float
     rate: float
     seed: int
+    want_loss: bool = True
 
 
 @dataclass(frozen=True)
 class StepResult:
-    """``loss``: mean image loss. ``bad``: name of the parameter whose gradient was not finite (nothing
-    was changed then), or None."""
+    """``loss``: mean image loss, or None when it was not wanted. ``bad``: name of the parameter whose gradient
+    was not finite (nothing was changed then), or None."""
 
-    loss: float
+    loss: float | None
     bad: str | None
 
 
 def gradients(
     model: Model, grid: Grid, quality: Quality, loss: Loss, laplacian: Laplacian | None, inputs: StepInputs
 ) -> tuple[mi.Float, dict[str, mi.Float]]:
-    """Mean image loss (width 1) and the gradient of every parameter."""
+    """Mean image loss (width 1; only part of it without ``want_loss``) and the gradient of every parameter."""
     records = inputs.views.records()
     layer = model.fitted_layer()
     positions = mi.Float(model.positions())
@@ -61,16 +63,25 @@ def gradients(
         dr.enable_grad(layer.pyramid.texels)
     maps = model.maps(layer)
     edges = model.topology.edges
-    frame = gradient.render(model.scene, surface, maps, edges, records, grid, quality, inputs.seed)
+    frame = gradient.render(model.scene, surface, maps, edges, records, grid, quality, inputs.seed, defer=True)
     behind = np.concatenate([inputs.background, np.zeros((len(inputs.background), 1))], axis=1)
     background = mi.Float(np.ascontiguousarray(behind, np.float32).ravel())
-    value, by_image = image_loss(loss, frame.image, inputs.reference, background, grid.resolution**2)
-    objective = gradient.surrogate(frame, surface, maps, edges, by_image, quality)
+    per_view = dr.opaque(mi.UInt32, grid.resolution**2)
+
+    def pixel_loss(color: mi.Color3f, pixel: mi.UInt32) -> mi.Float:
+        return covered_loss(loss, color, pixel, inputs.reference, background, per_view)
+
+    value, by_image = image_loss(loss, frame.image, inputs.reference, background, per_view, frame.complete())
+    terms = gradient.surrogate(frame, surface, maps, edges, by_image)
+    direct = gradient.direct(frame, surface, maps, pixel_loss)
+    if direct is not None:
+        terms.append(direct)
     if moving and laplacian is not None:
-        objective += laplacian(positions) * dr.opaque(mi.Float, inputs.laplacian_weight)
+        terms.append(laplacian.per_vertex(positions) * dr.opaque(mi.Float, inputs.laplacian_weight))
+    gradient.backward(terms)
+    if direct is not None and inputs.want_loss:
+        value += dr.sum(dr.detach(direct))
     out: dict[str, mi.Float] = {}
-    if dr.grad_enabled(objective):
-        dr.backward(objective)
     if moving:
         out[POSITIONS] = dr.grad(positions)
     if layer is not None and model.codec is not None:
@@ -96,7 +107,7 @@ def step(
         for name, parameter in model.parameters.items():
             parameter.value, moments[name] = adam.update(parameter, grads[name], moments[name], inputs.rate)
         model.update_scene()
-    return StepResult(float(value[0]), bad)
+    return StepResult(float(value[0]) if inputs.want_loss else None, bad)
 
 
 def first_non_finite(grads: dict[str, mi.Float]) -> str | None:

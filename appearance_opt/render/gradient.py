@@ -7,11 +7,16 @@ samples again, with gradients, and pulls back
   + sum over silhouette points  length * <dLoss/dI(pixel), c_in - c_out> n.x  (visibility),
 
 everything but the surface's buffers held fixed. The image itself is never differentiated.
+
+Most pixels hold one sample and no silhouette: their colour is that of the sample. When the loss is a sum over
+pixels, ``render(..., defer=True)`` leaves them out, and ``direct`` shades them, takes the loss and goes back in
+one kernel: half the work.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
@@ -22,6 +27,9 @@ from appearance_opt.render.material import MaterialMaps
 from appearance_opt.render.rays import MISS, Samples
 from appearance_opt.render.silhouette import EdgeList, EdgeSamples
 from appearance_opt.render.surface import Surface
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
 
 
 @dataclass(frozen=True)
@@ -40,19 +48,38 @@ class Quality:
 class Frame:
     """A rendered batch and what its backward pass needs.
 
-    ``image``: (pixels * 4) premultiplied linear radiance and coverage. ``samples``: the covered camera
-    rays with their ``pixel`` and ``weight``; None where nothing was hit. ``edges``: visible silhouette
-    points, None without any; ``contrast``: c_in - c_out at them, premultiplied RGB and coverage.
+    ``image``: (pixels * 4) premultiplied linear radiance and coverage, without the deferred pixels.
+    ``averaged``: the covered camera rays that are averaged in it; ``deferred``: those that are not in the image
+    yet, each the only one of its pixel; None without any. ``edges``: visible silhouette points, None without
+    any; ``contrast``: c_in - c_out at them, premultiplied RGB and coverage.
     """
 
     grid: Grid
     records: mi.Float
     image: mi.Float
-    samples: Samples | None
-    pixel: mi.UInt32 | None
-    weight: mi.Float | None
+    averaged: Weighted | None
+    deferred: Weighted | None
     edges: EdgeSamples | None
     contrast: mi.ArrayXf | None
+
+    def complete(self) -> mi.Bool | None:
+        """(pixels,) which pixels of the image are not deferred; None if none is."""
+        if self.deferred is None:
+            return None
+        out = dr.full(mi.Bool, True, self.grid.pixels)
+        dr.scatter(out, mi.Bool(False), self.deferred.pixel)
+        return out
+
+
+@dataclass
+class Weighted:
+    """Covered camera rays, the ``pixel`` of each and its ``weight`` there (None: one), and their ``width`` in
+    pixels, which selects mip levels."""
+
+    samples: Samples
+    pixel: mi.UInt32
+    weight: mi.Float | None
+    width: mi.Float
 
 
 def render(
@@ -64,66 +91,77 @@ def render(
     grid: Grid,
     quality: Quality,
     seed: int,
+    defer: bool = False,
 ) -> Frame:
-    """Forward pass, without gradients (``surface`` and ``maps`` are read detached)."""
+    """Forward pass, without gradients (``surface`` and ``maps`` are read detached). With ``defer``, pixels of
+    a single sample are not shaded but left to ``direct``."""
     with dr.suspend_grad():
         edges = None
         if edge_list is not None and quality.edge_density > 0:
             edges = silhouette.sample_edges(
                 scene, edge_list, surface.vertices, records, grid, quality.edge_density, seed
             )
-        samples, pixel, weight = _camera_samples(scene, records, grid, edges, quality)
+        averaged, deferred = _camera_samples(scene, records, grid, edges, quality, defer)
         image = dr.zeros(mi.Float, grid.pixels * 4)
-        if samples is not None:
-            c = shade(surface, maps, records, samples, grid.size, _width(weight, quality))
-            value = mi.ArrayXf([c.x * weight, c.y * weight, c.z * weight, weight])
-            dr.scatter_reduce(dr.ReduceOp.Add, image, value, pixel, mode=dr.ReduceMode.Local)
+        if averaged is not None:
+            w = averaged.weight
+            c = shade(surface, maps, records, averaged.samples, grid.size, averaged.width)
+            value = mi.ArrayXf([c.x * w, c.y * w, c.z * w, w])
+            dr.scatter_reduce(dr.ReduceOp.Add, image, value, averaged.pixel, mode=dr.ReduceMode.Local)
         contrast = None if edges is None else _contrast(surface, maps, records, edges, grid.size)
         dr.eval(image, contrast)
-    return Frame(grid, records, image, samples, pixel, weight, edges, contrast)
+    return Frame(grid, records, image, averaged, deferred, edges, contrast)
+
+
+def direct(
+    frame: Frame, surface: Surface, maps: MaterialMaps, pixel_loss: Callable[[mi.Color3f, mi.UInt32], mi.Float]
+) -> mi.Float | None:
+    """Loss of each deferred pixel, differentiable: ``pixel_loss(radiance, pixel)`` of its radiance (all
+    deferred pixels are fully covered). None without any."""
+    if frame.deferred is None:
+        return None
+    d = frame.deferred
+    return pixel_loss(shade(surface, maps, frame.records, d.samples, frame.grid.size, d.width), d.pixel)
 
 
 def surrogate(
-    frame: Frame,
-    surface: Surface,
-    maps: MaterialMaps,
-    edge_list: EdgeList | None,
-    image_gradient: mi.Float,
-    quality: Quality,
-) -> mi.Float:
-    """Scalar whose derivative is the loss's, for ``image_gradient`` = dLoss/dImage (pixels * 4).
+    frame: Frame, surface: Surface, maps: MaterialMaps, edge_list: EdgeList | None, image_gradient: mi.Float
+) -> list[mi.Float]:
+    """Arrays whose sums have the loss's derivative, for ``image_gradient`` = dLoss/dImage (pixels * 4).
 
-    Only its gradient means anything. Zero width-1 array when the frame is empty.
+    Only their gradients mean anything: pass them to ``backward``. They are not summed here, as a sum would
+    evaluate them and make the backward pass shade once more. Empty when the frame is.
     """
-    size = frame.grid.size
-    total = mi.Float(0)
-    if frame.samples is not None:
-        assert frame.pixel is not None and frame.weight is not None
-        color = shade(surface, maps, frame.records, frame.samples, size, _width(frame.weight, quality))
-        g = _pixel(image_gradient, frame.pixel)
-        total += dr.sum(dr.fma(g[0], color.x, dr.fma(g[1], color.y, g[2] * color.z)) * frame.weight)
+    terms = []
+    if frame.averaged is not None:
+        a = frame.averaged
+        color = shade(surface, maps, frame.records, a.samples, frame.grid.size, a.width)
+        g = _pixel(image_gradient, a.pixel)
+        terms.append(dr.fma(g[0], color.x, dr.fma(g[1], color.y, g[2] * color.z)) * a.weight)
     if frame.edges is not None and edge_list is not None and dr.grad_enabled(surface.vertices):
         assert frame.contrast is not None
         g, c = _pixel(image_gradient, frame.edges.pixel), frame.contrast
         jump = dr.fma(g[0], c[0], dr.fma(g[1], c[1], dr.fma(g[2], c[2], g[3] * c[3]))) * frame.edges.length
-        moved = silhouette.motion(edge_list, surface.vertices, frame.records, frame.edges, size)
-        total += dr.sum(jump * moved)
-    return total
+        moved = silhouette.motion(edge_list, surface.vertices, frame.records, frame.edges, frame.grid.size)
+        terms.append(jump * moved)
+    return terms
 
 
-def _width(weight: mi.Float, quality: Quality) -> mi.Float:
-    """Width in pixels of camera samples with the given share of their pixel."""
-    return dr.sqrt(weight) * dr.opaque(mi.Float, quality.sample_width)
+def backward(terms: list[mi.Float]) -> None:
+    """Propagate the gradient of the sum of all entries of all arrays, in one traversal."""
+    moving = [t for t in terms if dr.grad_enabled(t)]
+    for term in moving:
+        dr.set_grad(term, 1.0)
+        dr.enqueue(dr.ADMode.Backward, term)
+    if moving:
+        dr.traverse(dr.ADMode.Backward)
 
 
 def _camera_samples(
-    scene: mi.Scene,
-    records: mi.Float,
-    grid: Grid,
-    edges: EdgeSamples | None,
-    quality: Quality,
-) -> tuple[Samples | None, mi.UInt32 | None, mi.Float | None]:
-    """Covered camera rays: ``samples`` in each pixel, ``edge_samples`` where a silhouette passes."""
+    scene: mi.Scene, records: mi.Float, grid: Grid, edges: EdgeSamples | None, quality: Quality, defer: bool
+) -> tuple[Weighted | None, Weighted | None]:
+    """Covered camera rays, (averaged, deferred): ``samples`` in each pixel, ``edge_samples`` where a silhouette
+    passes."""
     crossed = dr.zeros(mi.Bool, grid.pixels)
     if edges is not None:
         dr.scatter(crossed, mi.Bool(True), edges.pixel)
@@ -136,16 +174,30 @@ def _camera_samples(
         dr.eval(hits, on_edge)
         parts.append(rays.keep(hits, dr.compress((hits.triangle != MISS) & ~on_edge)))
         weights.append(1 / quality.samples)
+    deferred = None
+    if defer and quality.samples == 1:
+        deferred = _weighted(parts, None, grid, quality)
+        parts, weights = [], []
     if edges is not None:
         parts.append(_fine_samples(scene, records, grid, dr.compress(on_edge), quality.edge_samples))
         weights.append(1 / quality.edge_samples)
-    parts_weights = [(p, w) for p, w in zip(parts, weights, strict=True) if dr.width(p.triangle)]
+    return _weighted(parts, weights, grid, quality), deferred
+
+
+def _weighted(parts: list[Samples], weights: list[float] | None, grid: Grid, quality: Quality) -> Weighted | None:
+    """Lists of samples as one; each list has its weight (None: one)."""
+    parts_weights = [(p, w) for p, w in zip(parts, weights or [1.0] * len(parts), strict=True) if dr.width(p.triangle)]
     if not parts_weights:
-        return None, None, None
+        return None
     samples = _concat([p for p, _ in parts_weights])
+    width = dr.opaque(mi.Float, quality.sample_width)
+    pixel = pixel_index(samples, grid.rows)
+    if weights is None:
+        dr.eval(samples, pixel)
+        return Weighted(samples, pixel, None, width)
     weight = _joined([dr.full(mi.Float, w, dr.width(p.triangle)) for p, w in parts_weights])
-    dr.eval(samples, weight)
-    return samples, pixel_index(samples, grid.rows), weight
+    dr.eval(samples, weight, pixel)
+    return Weighted(samples, pixel, weight, dr.sqrt(weight) * width)
 
 
 def _fine_samples(scene: mi.Scene, records: mi.Float, grid: Grid, index: mi.UInt32, count: int) -> Samples:
