@@ -16,6 +16,7 @@ from appearance_opt.fit.step import StepInputs, gradients
 from appearance_opt.initial.sphere import sphere
 from appearance_opt.latent.latent import LatentMesh, LatentTopology, local_edge_length
 from appearance_opt.latent.texels import TexelCodec
+from appearance_opt.reference.pool import Targets
 from appearance_opt.render import deferred, gradient
 from appearance_opt.render.deferred import Grid
 from appearance_opt.render.gradient import Quality
@@ -48,7 +49,7 @@ def make_model(triangles: int = 300, size: int = 32, fit: tuple[str, ...] = ("sh
 def make_inputs(model: Model, grid: Grid, seed: int = 0) -> StepInputs:
     views = SAMPLER.draw(seed, grid.views)
     reference = mi.Float(np.random.default_rng(seed).random(grid.pixels * 4).astype(np.float32) * 0.5)
-    return StepInputs(views, reference, np.full((grid.views, 3), 0.4, np.float32), 0.0, 0.0, 3)
+    return StepInputs(views, Targets(reference), np.full((grid.views, 3), 0.4, np.float32), 0.0, 0.0, 3)
 
 
 def test_texel_gradients_agree_with_finite_differences() -> None:

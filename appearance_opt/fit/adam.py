@@ -16,20 +16,26 @@ if TYPE_CHECKING:
 BETA_1, BETA_2, EPSILON = 0.9, 0.999, 1e-12
 """EPSILON is far below the published 1e-8: gradients of a mean over a million pixels are that small."""
 
+AVERAGING = 8
+"""The mean of the values is over about the last 1/AVERAGING of all steps (polynomial-decay averaging, Shamir and
+Zhang 2013). It is what a fit hands out: the noise of few views per step averages out in it."""
+
 
 @dataclass
 class Moments:
-    """First and second moment of each element's gradient, and the number of steps they hold."""
+    """First and second moment of each element's gradient, the running ``mean`` of its value (see ``AVERAGING``),
+    and the number of steps they hold."""
 
     first: mi.Float
     second: mi.Float
+    mean: mi.Float
     steps: int = 0
 
 
 def moments_of(parameter: Parameter) -> Moments:
     """Moments before the first step."""
     n = dr.width(parameter.value)
-    return Moments(dr.zeros(mi.Float, n), dr.zeros(mi.Float, n))
+    return Moments(dr.zeros(mi.Float, n), dr.zeros(mi.Float, n), mi.Float(parameter.value))
 
 
 def update(parameter: Parameter, gradient: mi.Float, moments: Moments, rate: float) -> tuple[mi.Float, Moments]:
@@ -50,5 +56,7 @@ def update(parameter: Parameter, gradient: mi.Float, moments: Moments, rate: flo
             value = clamp(
                 value, dr.gather(mi.Float, parameter.low, channel), dr.gather(mi.Float, parameter.high, channel)
             )
-    dr.eval(value, first, second)
-    return value, Moments(first, second, steps)
+    share = dr.opaque(mi.Float, (AVERAGING + 1) / (steps + AVERAGING))
+    mean = dr.fma(value - moments.mean, share, moments.mean)
+    dr.eval(value, first, second, mean)
+    return value, Moments(first, second, mean, steps)

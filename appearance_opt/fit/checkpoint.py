@@ -69,6 +69,7 @@ class Checkpointer:
             arrays[f"value/{name}"] = np.array(parameter.value)
             arrays[f"first/{name}"] = np.array(moments.first)
             arrays[f"second/{name}"] = np.array(moments.second)
+            arrays[f"mean/{name}"] = np.array(moments.mean)
             arrays[f"steps/{name}"] = np.array(moments.steps)
             if state.best is not None:
                 arrays[f"best/{name}"] = np.array(state.best[name])
@@ -109,8 +110,8 @@ def _fill(model: Model, state: FitState, arrays: dict[str, np.ndarray]) -> None:
     best = {}
     for name, parameter in model.parameters.items():
         parameter.value = mi.Float(arrays[f"value/{name}"])
-        first, second = mi.Float(arrays[f"first/{name}"]), mi.Float(arrays[f"second/{name}"])
-        state.moments[name] = Moments(first, second, int(arrays[f"steps/{name}"]))
+        first, second, mean = (mi.Float(arrays[f"{kind}/{name}"]) for kind in ("first", "second", "mean"))
+        state.moments[name] = Moments(first, second, mean, int(arrays[f"steps/{name}"]))
         if f"best/{name}" in arrays:
             best[name] = mi.Float(arrays[f"best/{name}"])
     for name in _NUMBERS:

@@ -174,13 +174,17 @@ class _Run:
 
     def look(self) -> None:
         """Render the held-out views; remember the state if it is the best so far."""
-        self.psnr = self.validation.psnr(self.model)
         state = self.state
+        current = self.model.values()
+        means = {name: moments.mean for name, moments in state.moments.items()}
+        self.model.restore(means)
+        self.psnr = self.validation.psnr(self.model)
         point = CurvePoint(self.clock.time(), state.iteration, self.psnr, state.loss)
         if not self.result.curve or self.result.curve[-1].step != state.iteration:
             self.result.curve.append(point)
         if state.best is None or self.psnr > state.best_psnr:
-            state.best, state.best_psnr, state.best_iteration = self.model.values(), self.psnr, state.iteration
+            state.best, state.best_psnr, state.best_iteration = means, self.psnr, state.iteration
+        self.model.restore(current)
 
     def finish(self, look: bool) -> None:
         """A last look, then back to the best state."""

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
     from appearance_opt.fit.laplacian import Laplacian
     from appearance_opt.fit.losses import Loss
+    from appearance_opt.reference.pool import Targets
     from appearance_opt.render.deferred import Grid
     from appearance_opt.render.gradient import Quality
     from appearance_opt.views import Views
@@ -31,7 +32,7 @@ class StepInputs:
     does not need the value of the loss; evaluating it shades all samples once more."""
 
     views: Views
-    reference: mi.Float
+    reference: Targets
     background: np.ndarray
     laplacian_weight: float
     rate: float
@@ -68,10 +69,13 @@ def gradients(
     background = mi.Float(np.ascontiguousarray(behind, np.float32).ravel())
     per_view = dr.opaque(mi.UInt32, grid.resolution**2)
 
-    def pixel_loss(color: mi.Color3f, pixel: mi.UInt32) -> mi.Float:
-        return covered_loss(loss, color, pixel, inputs.reference, background, per_view)
+    average = inputs.reference.average
+    points = average if inputs.reference.points is None else inputs.reference.points
 
-    value, by_image = image_loss(loss, frame.image, inputs.reference, background, per_view, frame.complete())
+    def pixel_loss(color: mi.Color3f, pixel: mi.UInt32) -> mi.Float:
+        return covered_loss(loss, color, pixel, points, background, per_view)
+
+    value, by_image = image_loss(loss, frame.image, average, background, per_view, frame.complete())
     terms = gradient.surrogate(frame, surface, maps, edges, by_image)
     direct = gradient.direct(frame, surface, maps, pixel_loss)
     if direct is not None:

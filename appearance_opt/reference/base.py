@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 if TYPE_CHECKING:
     import numpy as np
@@ -20,3 +20,15 @@ class Reference(Protocol):
     """
 
     def render(self, views: Views, resolution: int, samples: int = 16) -> NDArray[np.float32]: ...
+
+
+@runtime_checkable
+class PointReference(Reference, Protocol):
+    """A reference that can also look along single rays.
+
+    ``points`` returns the same as ``render``, but what the ray through the middle of each pixel sees, its textures
+    filtered over ``width`` pixels. A fit that compares point with point needs one sample per pixel and sees no
+    aliasing: both sides alias alike.
+    """
+
+    def points(self, views: Views, resolution: int, width: float) -> NDArray[np.float32]: ...

@@ -69,6 +69,13 @@ class MeshReference:
 
     def render(self, views: Views, resolution: int, samples: int = 16) -> NDArray[np.float32]:
         """See ``Reference.render``."""
+        return self._render(views, resolution, samples, samples**-0.5)
+
+    def points(self, views: Views, resolution: int, width: float) -> NDArray[np.float32]:
+        """See ``PointReference.points``."""
+        return self._render(views, resolution, 1, width)
+
+    def _render(self, views: Views, resolution: int, samples: int, width: float) -> NDArray[np.float32]:
         step = max(1, MAX_PIXELS // (resolution * resolution))
         images = []
         grid = None
@@ -76,14 +83,15 @@ class MeshReference:
             part = views[start : start + step]
             if grid is None or grid.views != len(part):
                 grid = Grid(len(part), resolution)
-            image = self.render_device(part.records(), grid, samples)
+            image = self.render_device(part.records(), grid, samples, width)
             images.append(np.array(image).reshape(len(part), resolution, resolution, 4))
         return images[0] if len(images) == 1 else np.concatenate(images)
 
-    def render_device(self, records: mi.Float, grid: Grid, samples: int) -> mi.Float:
-        """The same for a batch whose records are on the device; the image stays there, flat."""
+    def render_device(self, records: mi.Float, grid: Grid, samples: int, width: float = 1.0) -> mi.Float:
+        """The same for a batch whose records are on the device; the image stays there, flat. Textures are filtered
+        over ``width`` pixels."""
         with dr.suspend_grad():
-            return deferred.render_image(self.scene, self.surface, self.maps, records, grid, samples)
+            return deferred.render_image(self.scene, self.surface, self.maps, records, grid, samples, width)
 
     def sample(self, triangle: mi.UInt32, b1: mi.Float, b2: mi.Float, area: mi.Float) -> SurfaceSample:
         """Appearance at barycentric points of triangles, averaged over a patch of ``area`` (world units

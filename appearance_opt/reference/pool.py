@@ -10,6 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 from appearance_opt.errors import ReferenceRenderError
+from appearance_opt.reference.base import PointReference
 from appearance_opt.views import Views
 
 if TYPE_CHECKING:
@@ -17,6 +18,15 @@ if TYPE_CHECKING:
 
     from appearance_opt.reference.base import Reference
     from appearance_opt.views import ViewSampler
+
+
+@dataclass(frozen=True)
+class Targets:
+    """Reference images of a batch, flat (batch * pixels * 4): ``average`` over the pixels' areas, and what the rays
+    through their middles see (``points``), or None where the reference cannot tell."""
+
+    average: mi.Float
+    points: mi.Float | None = None
 
 
 @dataclass
@@ -34,11 +44,13 @@ class ReferencePool:
     batch: int
     resolution: int
     samples: int
+    point_width: float = 0.4
     _images: dict[int, mi.Float16] = field(default_factory=dict)
+    _points: dict[int, mi.Float16] = field(default_factory=dict)
     _views: dict[int, Views] = field(default_factory=dict)
 
-    def draw(self, iteration: int) -> tuple[Views, mi.Float]:
-        """The views of an iteration and their images, flat (batch * pixels * 4)."""
+    def draw(self, iteration: int) -> tuple[Views, Targets]:
+        """The views of an iteration and their images."""
         groups = max(1, self.capacity // self.batch)
         if iteration < groups:  # the first pass fills the pool, a whole batch at a time
             members = np.arange(self.batch) + iteration * self.batch
@@ -49,17 +61,27 @@ class ReferencePool:
         if missing:
             self._render(sorted({k // self.batch for k in missing}))
         views = Views.concatenate([self._views[int(k)] for k in members])
-        return views, mi.Float(dr.concat([self._images[int(k)] for k in members]))
+        images, points = (
+            mi.Float(dr.concat([kept[int(k)] for k in members])) if kept else None
+            for kept in (self._images, self._points)
+        )
+        assert images is not None
+        return views, Targets(images, points)
 
     def _render(self, groups: list[int]) -> None:
         for group in groups:
             views = self.sampler.draw(group, self.batch)
-            images = checked(self.reference.render(views, self.resolution, self.samples), f"pool batch {group}")
+            images = self.reference.render(views, self.resolution, self.samples)
+            self._keep(self._images, group, images)
+            if isinstance(self.reference, PointReference):
+                self._keep(self._points, group, self.reference.points(views, self.resolution, self.point_width))
             for k in range(self.batch):
-                member = group * self.batch + k
-                half = np.minimum(images[k], np.finfo(np.float16).max).astype(np.float16)
-                self._images[member] = mi.Float16(half.ravel())
-                self._views[member] = views[k : k + 1]
+                self._views[group * self.batch + k] = views[k : k + 1]
+
+    def _keep(self, kept: dict[int, mi.Float16], group: int, images: NDArray[np.float32]) -> None:
+        images = np.minimum(checked(images, f"pool batch {group}"), np.finfo(np.float16).max).astype(np.float16)
+        for k in range(self.batch):
+            kept[group * self.batch + k] = mi.Float16(images[k].ravel())
 
 
 def checked(images: NDArray[np.float32], what: str) -> NDArray[np.float32]:

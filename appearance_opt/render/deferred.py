@@ -59,14 +59,21 @@ def pixel_index(samples: Samples, resolution: mi.UInt32) -> mi.UInt32:
 
 
 def render_image(
-    scene: mi.Scene, surface: Surface, maps: MaterialMaps, records: mi.Float, grid: Grid, samples: int
+    scene: mi.Scene,
+    surface: Surface,
+    maps: MaterialMaps,
+    records: mi.Float,
+    grid: Grid,
+    samples: int,
+    width: float | None = None,
 ) -> mi.Float:
-    """A whole batch of images with ``samples`` samples in every pixel, without gradients.
+    """A whole batch of images with ``samples`` samples in every pixel, without gradients. Textures are filtered
+    over ``width`` pixels (the share of a sample).
 
     Returns (pixels * 4) premultiplied linear radiance and coverage. One sample of all pixels at a time,
     so that memory does not grow with ``samples``.
     """
-    width = dr.opaque(mi.Float, samples**-0.5)
+    filtered = dr.opaque(mi.Float, samples**-0.5 if width is None else width)
     image = dr.zeros(mi.Float, grid.pixels * 4)
     weight = dr.opaque(mi.Float, 1 / samples)
     for dx, dy in rays.sub_pixel_offsets(samples):
@@ -78,7 +85,7 @@ def render_image(
         if dr.width(index) == 0:
             continue
         hits = rays.keep(hits, index)
-        color = shade(surface, maps, records, hits, grid.size, width)
+        color = shade(surface, maps, records, hits, grid.size, filtered)
         value = mi.ArrayXf([color.x * weight, color.y * weight, color.z * weight, weight])
         # one sample per pixel in each pass: no two threads meet
         dr.scatter_reduce(dr.ReduceOp.Add, image, value, pixel_index(hits, grid.rows), mode=dr.ReduceMode.NoConflicts)

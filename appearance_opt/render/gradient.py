@@ -42,6 +42,7 @@ class Quality:
     edge_samples: int = 8
     samples: int = 1
     sample_width: float = 0.7
+    point_width: float = 0.4
 
 
 @dataclass
@@ -176,21 +177,21 @@ def _camera_samples(
         weights.append(1 / quality.samples)
     deferred = None
     if defer and quality.samples == 1:
-        deferred = _weighted(parts, None, grid, quality)
+        deferred = _weighted(parts, None, grid, quality.point_width)
         parts, weights = [], []
     if edges is not None:
         parts.append(_fine_samples(scene, records, grid, dr.compress(on_edge), quality.edge_samples))
         weights.append(1 / quality.edge_samples)
-    return _weighted(parts, weights, grid, quality), deferred
+    return _weighted(parts, weights, grid, quality.sample_width), deferred
 
 
-def _weighted(parts: list[Samples], weights: list[float] | None, grid: Grid, quality: Quality) -> Weighted | None:
+def _weighted(parts: list[Samples], weights: list[float] | None, grid: Grid, width_of_one: float) -> Weighted | None:
     """Lists of samples as one; each list has its weight (None: one)."""
     parts_weights = [(p, w) for p, w in zip(parts, weights or [1.0] * len(parts), strict=True) if dr.width(p.triangle)]
     if not parts_weights:
         return None
     samples = _concat([p for p, _ in parts_weights])
-    width = dr.opaque(mi.Float, quality.sample_width)
+    width = dr.opaque(mi.Float, width_of_one)
     pixel = pixel_index(samples, grid.rows)
     if weights is None:
         dr.eval(samples, pixel)

@@ -73,6 +73,7 @@ def run_case(resolution: int, latent: int, reference: int, maps: int, live: bool
     from appearance_opt.fit.loop import LOSS_EVERY
     from appearance_opt.fit.losses import LOSSES
     from appearance_opt.fit.step import StepInputs, first_non_finite, step
+    from appearance_opt.reference.pool import Targets
     from appearance_opt.render.deferred import Grid
     from appearance_opt.render.gradient import Quality
 
@@ -89,7 +90,7 @@ def run_case(resolution: int, latent: int, reference: int, maps: int, live: bool
         if live:
             image = source.render_device(v.records(), grid, 1)
         background = np.full((4, 3), 0.3, np.float32)
-        inputs = StepInputs(v, image, background, 0.01, 1.0, k, want_loss=k % LOSS_EVERY == 0)
+        inputs = StepInputs(v, Targets(image), background, 0.01, 1.0, k, want_loss=k % LOSS_EVERY == 0)
         step(model, moments, grid, Quality(1.0, 4, 1), LOSSES["log-srgb-l1"], laplacian, inputs, first_non_finite)
 
     for k in range(10):
