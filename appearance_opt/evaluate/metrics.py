@@ -7,10 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from appearance_opt.asset.types import linear_to_srgb
-
-BACKGROUND = 0.18
-"""Linear grey behind both images."""
+from appearance_opt.render.display import display
 
 BEST_PSNR = 99.0
 
@@ -38,11 +35,6 @@ class Metrics:
     silhouette_iou: float
     silhouette_shift: float
     views: tuple[ViewMetrics, ...]
-
-
-def display(image: NDArray) -> NDArray[np.float32]:
-    """(..., 4) premultiplied linear radiance and coverage to (..., 3) sRGB values over grey."""
-    return linear_to_srgb(np.clip(image[..., :3] + BACKGROUND * (1 - image[..., 3:]), 0, 1).astype(np.float32))
 
 
 def compare_images(reference: NDArray, candidate: NDArray) -> Metrics:

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from appearance_opt.asset.types import Asset, linear_to_srgb
-from appearance_opt.evaluate.metrics import display
+from appearance_opt.render.display import display
 
 DIFFERENCE_GAIN = 4.0
 

@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from appearance_opt.asset.types import linear_to_srgb
 from appearance_opt.reference.pool import checked
 from appearance_opt.render.deferred import Grid, render_image
+from appearance_opt.render.display import display
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -16,8 +16,6 @@ if TYPE_CHECKING:
     from appearance_opt.fit.model import Model
     from appearance_opt.reference.base import Reference
     from appearance_opt.views import Views
-
-BACKGROUND = 0.18
 
 
 class Validation:
@@ -27,7 +25,7 @@ class Validation:
         self.views, self.resolution, self.samples = views, resolution, samples
         self._grid = Grid(len(views), resolution)
         images = checked(reference.render(views, resolution, samples), "held-out views")
-        self._reference = _display(images)
+        self._reference = display(images)
         self._covered = images[..., 3] > 0
 
     def render(self, model: Model) -> NDArray[np.float32]:
@@ -41,11 +39,7 @@ class Validation:
         """Mean over the views of the PSNR in dB of display values (sRGB, clipped) over the pixels that
         either image covers."""
         image = self.render(model)
-        error = np.mean((_display(image) - self._reference) ** 2, axis=-1)
+        error = np.mean((display(image) - self._reference) ** 2, axis=-1)
         either = self._covered | (image[..., 3] > 0)
         each = [e[m].mean() if m.any() else 1e-10 for e, m in zip(error, either, strict=True)]
         return float(np.mean([-10 * np.log10(max(e, 1e-10)) for e in each]))
-
-
-def _display(image: NDArray[np.float32]) -> NDArray[np.float32]:
-    return linear_to_srgb(np.clip(image[..., :3] + BACKGROUND * (1 - image[..., 3:]), 0, 1))

@@ -56,12 +56,12 @@ def importance(positions: NDArray, faces: NDArray, counts: NDArray) -> tuple[NDA
         near = np.zeros(n, bool)
         near[f[visible].ravel()] = True
         visible = near[f].any(axis=1)
-    density = _around(counts.astype(np.float64), f, n) / np.maximum(_around(area, f, n), 1e-30)
+    density = around(counts.astype(np.float64), f, n) / np.maximum(around(area, f, n), 1e-30)
     density = density[f].mean(axis=1)
     best = np.quantile(density[visible], 0.9) if visible.any() else 1.0
     return np.where(visible, np.clip(density / max(best, 1e-30), FLOOR, 1.0), HIDDEN), visible
 
 
-def _around(values: NDArray, faces: NDArray, count: int) -> NDArray:
+def around(values: NDArray, faces: NDArray, count: int) -> NDArray:
     """Sum over the faces around each vertex."""
     return sum((np.bincount(faces[:, k], values, count) for k in range(3)), np.zeros(count))

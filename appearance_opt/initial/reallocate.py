@@ -1,0 +1,101 @@
+"""Triangles go to where the image error is.
+
+The quadric metric knows distances, not appearance: whether a flattened bump is seen depends on contrast, on
+texture and on the directions it is seen from. So the decimated mesh is drawn beside the reference, the error of
+the pixels is collected on the faces of the reference, and the reference is decimated once more with the
+faces weighted by it. One round gains 0.3 to 0.5 dB at the same count; the best start of all rounds is kept.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from scipy.ndimage import maximum_filter
+
+from appearance_opt.asset.normals import weld
+from appearance_opt.initial.visibility import around
+from appearance_opt.latent.latent import LatentTopology
+from appearance_opt.latent.texels import TexelCodec
+from appearance_opt.render import rays, upload
+from appearance_opt.render.deferred import Grid, render_image
+from appearance_opt.render.display import display
+from appearance_opt.render.material import CHANNELS, MaterialMaps
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from numpy.typing import NDArray
+
+    from appearance_opt.latent.latent import LatentMesh
+    from appearance_opt.reference.mesh import MeshReference
+    from appearance_opt.views import ViewSampler
+
+VIEWS, BATCH, RESOLUTION, SAMPLES = 64, 8, 256, 4
+"""Views in which the error is measured, and how."""
+
+RINGS = 6
+"""Rings of faces over which the error is averaged: about the size of a new triangle. Without it the noise of
+single pixels would be taken for detail."""
+
+POWER, LOWEST, HIGHEST = 0.35, 0.3, 3.0
+"""Weight = (error over its median)^POWER within bounds. Larger powers overshoot (0.6 loses what 0.35 gains)."""
+
+
+class StartError:
+    """How far a start looks from the reference, over views that neither the fit nor its validation uses."""
+
+    def __init__(self, reference: MeshReference, sampler: ViewSampler, views: int = VIEWS) -> None:
+        self.reference = reference
+        self._grid = Grid(BATCH, RESOLUTION)
+        self._records = [sampler.draw(k, BATCH).records() for k in range(views // BATCH)]
+        self._images = [self._display(reference.render_device(r, self._grid, SAMPLES, 0.5)) for r in self._records]
+
+    def measure(self, mesh: LatentMesh, maps: Mapping[str, NDArray]) -> tuple[float, NDArray[np.float64]]:
+        """(mean squared display error, its sum over the pixels that show each face of the reference (F,))."""
+        total = dr.zeros(mi.Float, len(self.reference.merged.faces))
+        scene, topology = upload.scene_of(mesh.positions, mesh.faces), LatentTopology(mesh, tangents=True)
+        codec = TexelCodec(tuple(c for c in CHANNELS if c in maps), len(maps["red"]))
+        layers = MaterialMaps((codec.layer(codec.encode(maps)),))
+        surface = topology.surface(mi.Float(np.ascontiguousarray(mesh.positions, np.float32).ravel()))
+        mean = 0.0
+        for records, expected in zip(self._records, self._images, strict=True):
+            image = self._display(render_image(scene, surface, layers, records, self._grid, SAMPLES))
+            error = np.mean((image - expected) ** 2, axis=-1)
+            mean += float(error.mean()) / len(self._records)
+            # a pixel's neighbours answer for it, too: beside an outline the reference shows nothing to blame
+            spread = maximum_filter(error, size=(1, 3, 3))
+            self._collect(total, records, mi.Float(spread.ravel()))
+        return mean, np.array(total).astype(np.float64)
+
+    def _collect(self, total: mi.Float, records: mi.Float, error: mi.Float) -> None:
+        g = self._grid
+        hits = rays.trace(
+            self.reference.scene, records, g.view, mi.Float(g.column) + 0.5, mi.Float(g.row) + 0.5, g.size
+        )
+        seen = hits.triangle != rays.MISS
+        pixel = (g.view * g.rows + g.row) * g.rows + g.column
+        value = dr.gather(mi.Float, error, pixel)
+        dr.scatter_reduce(dr.ReduceOp.Add, total, value, dr.select(seen, hits.triangle, 0), seen)
+        dr.eval(total)
+
+    def _display(self, image: mi.Float) -> NDArray[np.float32]:
+        return display(np.array(image).reshape(BATCH, RESOLUTION, RESOLUTION, 4))
+
+
+def weights(positions: NDArray, faces: NDArray, error: NDArray, visible: NDArray) -> NDArray[np.float64]:
+    """(F,) factors for the importance of faces from the image error collected on each: error per area, averaged
+    over ``RINGS`` rings, relative to the median of the visible faces."""
+    first, place = weld(np.asarray(positions))
+    f = place[faces]
+    p = np.asarray(positions, np.float64)[first]
+    area = 0.5 * np.linalg.norm(np.cross(p[f[:, 1]] - p[f[:, 0]], p[f[:, 2]] - p[f[:, 0]]), axis=1)
+    for _ in range(RINGS):
+        error, area = (around(x, f, len(p))[f].mean(axis=1) / 6 for x in (error, area))
+    density = error / np.maximum(area, 1e-30)
+    middle = np.median(density[visible]) if visible.any() else 0.0
+    if middle <= 0:
+        return np.ones(len(faces))
+    return np.clip((density / middle) ** POWER, LOWEST, HIGHEST)
