@@ -16,18 +16,20 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from appearance_opt.render import rays, upload
+from appearance_opt.latent import mesh_ops
+from appearance_opt.render import brdf, deferred, material, rays, surface, upload
 from appearance_opt.render.deferred import shade
 from appearance_opt.render.rays import MISS
 from experiments.gradient_error.problems import BACKGROUND, Problem, smooth_fields
 
 CACHE = Path("out/gradient_error/cache")
-FIELDS = 24
-VERTICES = 40
-FIELD_SAMPLES, VERTEX_SAMPLES, TARGET_SAMPLES = 256, 1024, 1024
-STEP = 0.1
-"""Largest displacement of a difference, in pixels."""
+FIELDS = 20
+VERTICES = 20
+FIELD_SAMPLES, TARGET_SAMPLES = 128, 1024
+VERTEX_SAMPLES = (256, 1024)
+"""Least and most; in between as many as VERTEX_RAYS rays allow."""
 
+VERTEX_RAYS = 1 << 17
 CHUNK = 1 << 20
 
 
@@ -118,7 +120,7 @@ def pixel_losses(loss: str, image: NDArray, target: NDArray) -> float:
 
 def truth(problem: Problem, loss: str, force: bool = False) -> Truth:
     """The reference of a problem, from the cache where its hash is there."""
-    key = hashlib.sha256(Path(__file__).read_bytes() + _fingerprint(problem) + loss.encode()).hexdigest()[:20]
+    key = hashlib.sha256(_sources() + _fingerprint(problem) + loss.encode()).hexdigest()[:20]
     path = CACHE / f"{problem.name}_{problem.resolution}_{loss}_{key}.npz"
     if path.exists() and not force:
         with np.load(path) as data:
@@ -131,6 +133,12 @@ def truth(problem: Problem, loss: str, force: bool = False) -> Truth:
     return result
 
 
+def _sources() -> bytes:
+    """Source code of everything that the reference's images depend on."""
+    modules = (rays, deferred, surface, material, brdf, mesh_ops)
+    return b"".join(Path(str(m.__file__)).read_bytes() for m in modules) + Path(__file__).read_bytes()
+
+
 def _fingerprint(problem: Problem) -> bytes:
     parts = [repr(v).encode() if not isinstance(v, np.ndarray) else v.tobytes() for v in vars(problem).values()]
     return b"".join(parts)
@@ -141,7 +149,8 @@ def _compute(problem: Problem, loss: str) -> Truth:
     view = Supersampler(problem, problem.target_positions, problem.target_colors)
     target = view.image(everything, TARGET_SAMPLES, 7)
     view = Supersampler(problem, problem.positions, problem.colors)
-    step = STEP * problem.pixel_size
+    step = problem.step * problem.pixel_size
+    finer = round(0.1 / problem.step)
     scale = 1 / (3 * problem.resolution**2)
     start = problem.positions.astype(np.float64)
 
@@ -154,7 +163,7 @@ def _compute(problem: Problem, loss: str) -> Truth:
         return (values[:, 0] - values[:, 1]) / (2 * step) * scale
 
     fields = smooth_fields(problem.positions, FIELDS, 1).astype(np.float32)
-    by_field = np.stack([difference(f, everything, FIELD_SAMPLES) for f in fields], axis=1)
+    by_field = np.stack([difference(f, everything, finer * FIELD_SAMPLES) for f in fields], axis=1)
     vertices = _vertices_to_test(problem, view)
     by_vertex = np.zeros((2, len(vertices), 3))
     reach = _reach(problem, vertices)
@@ -162,7 +171,8 @@ def _compute(problem: Problem, loss: str) -> Truth:
         for axis in range(3):
             change = np.zeros_like(start)
             change[v, axis] = 1
-            by_vertex[:, k, axis] = difference(change, reach[k], VERTEX_SAMPLES) if len(reach[k]) else 0
+            samples = finer * int(np.clip(VERTEX_RAYS / max(len(reach[k]), 1), *VERTEX_SAMPLES))
+            by_vertex[:, k, axis] = difference(change, reach[k], samples) if len(reach[k]) else 0
     return Truth(target.astype(np.float32), fields, by_field, vertices, by_vertex)
 
 
