@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 import drjit as dr
 import mitsuba as mi
 
-from appearance_opt.render import rays, silhouette
+from appearance_opt.render import coverage, rays, silhouette
 from appearance_opt.render.deferred import Grid, pixel_index, shade
 from appearance_opt.render.material import MaterialMaps
 from appearance_opt.render.rays import MISS, Samples
@@ -110,6 +110,10 @@ def render(
             value = mi.ArrayXf([c.x * w, c.y * w, c.z * w, w])
             dr.scatter_reduce(dr.ReduceOp.Add, image, value, averaged.pixel, mode=dr.ReduceMode.Local)
         contrast = None if edges is None else _contrast(surface, maps, records, edges, grid.size)
+        if edges is not None and contrast is not None:
+            dr.eval(image, contrast)
+            missed = coverage.correction(edges, contrast, grid.pixels, quality.edge_samples, grid.rows)
+            image = coverage.corrected(image, missed)
         dr.eval(image, contrast)
     return Frame(grid, records, image, averaged, deferred, edges, contrast)
 

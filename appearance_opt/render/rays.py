@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 
 import drjit as dr
 import mitsuba as mi
@@ -107,9 +108,25 @@ def keep(samples: Samples, index: mi.UInt32) -> Samples:
     )
 
 
+@cache
 def sub_pixel_offsets(count: int) -> np.ndarray:
-    """(count, 2) well-spread positions in the unit square: the R2 sequence (Roberts 2018), centred so
-    that a single sample sits in the middle of the pixel."""
-    g = 1.32471795724474602596
-    k = np.arange(count)[:, None]
-    return ((0.5 + k * np.array([1 / g, 1 / g**2])) % 1.0).astype(np.float32)
+    """(count, 2) well-spread positions in the unit square: the rank-1 lattice (i, g i) / count whose points
+    lie farthest apart (on the torus), placed so that it is symmetric about the middle of the pixel.
+
+    Without the symmetry the image is shifted by the distance of the points' mean from the middle: by a
+    tenth of a pixel for 16 points of the R2 sequence, which biases silhouette gradients by 10 %.
+    """
+    i = np.arange(count)
+    best, generator = -1.0, 1
+    for g in range(1, max(count, 2)):
+        # at most two points in a row, and none on the border
+        if np.gcd(g, count) > 2 or not np.all((2 * i + 1) * g % (2 * count)):
+            continue
+        step = np.stack([i, i * g], 1)[1:] / count
+        step -= np.round(step)
+        apart = np.min(np.sum(step**2, 1), initial=1.0)
+        if apart > best:
+            best, generator = apart, g
+    points = (np.stack([i + 0.5, (i + 0.5) * generator % count], 1) / count).astype(np.float32)
+    points.setflags(write=False)
+    return points

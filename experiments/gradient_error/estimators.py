@@ -1,0 +1,56 @@
+"""Gradients of one problem by our renderer: what a step of a fit computes, at a given quality."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from appearance_opt.fit.losses import LOSSES
+from appearance_opt.fit.model import POSITIONS, Model, Rates
+from appearance_opt.fit.step import StepInputs, gradients
+from appearance_opt.render.deferred import Grid
+from appearance_opt.render.gradient import Quality
+from appearance_opt.render.surface import Surface
+from experiments.gradient_error.problems import BACKGROUND, Problem
+
+
+class ColoredModel(Model):
+    """A model of a problem's mesh with its vertex colours: Mitsuba splits a mesh at the seams of a texture."""
+
+    def __init__(self, problem: Problem) -> None:
+        constants = {"red": 1.0, "green": 1.0, "blue": 1.0}
+        constants |= {"roughness": problem.roughness, "metalness": problem.metalness}
+        super().__init__(problem.mesh, constants, frozenset(("shape",)), Rates())
+        self.colors = problem.surface(self.topology, self.positions(), problem.colors).colors
+
+    def surface(self, positions: mi.Float) -> Surface:
+        return replace(super().surface(positions), frames=None, corners=None, colors=self.colors)
+
+
+class Ours:
+    """One problem, ready to be differentiated again and again. ``target`` (P, 3): over the background."""
+
+    def __init__(self, problem: Problem, target: NDArray, loss: str) -> None:
+        self.loss = LOSSES[loss]
+        self.model = ColoredModel(problem)
+        self.grid = Grid(1, problem.resolution)
+        rgba = np.ones((len(target), 4), np.float32)
+        rgba[:, :3] = target
+        self.inputs = StepInputs(problem.views, mi.Float(rgba.ravel()), np.array([BACKGROUND], np.float32), 0.0, 0.0, 0)
+
+    def __call__(self, quality: Quality, seed: int) -> NDArray[np.float32]:
+        """dLoss/dPositions (V, 3)."""
+        return np.array(self.device(quality, seed)).reshape(-1, 3)
+
+    def device(self, quality: Quality, seed: int) -> mi.Float:
+        """The same on the device, as a step of a fit computes it, acceleration structure included."""
+        # a new array: Mitsuba skips parameters that are the same as before
+        self.model.parameters[POSITIONS].value = self.model.positions() + dr.opaque(mi.Float, 0.0)
+        self.model.update_scene()
+        inputs = replace(self.inputs, seed=seed)
+        _, grads = gradients(self.model, self.grid, quality, self.loss, None, inputs)
+        return grads[POSITIONS]
