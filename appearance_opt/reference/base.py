@@ -26,9 +26,11 @@ class Reference(Protocol):
 class PointReference(Reference, Protocol):
     """A reference that can also look along single rays.
 
-    ``points`` returns the same as ``render``, but what the ray through the middle of each pixel sees, its textures
-    filtered over ``width`` pixels. A fit that compares point with point needs one sample per pixel and sees no
-    aliasing: both sides alias alike.
+    ``pair`` returns two images like that of ``render``: one averaged over the pixels' areas at least where outlines
+    pass, and what the ray through the middle of each pixel sees, its textures filtered over ``width`` pixels. A fit
+    that compares point with point needs one sample per pixel and sees no aliasing: both sides alias alike.
     """
 
-    def points(self, views: Views, resolution: int, width: float) -> NDArray[np.float32]: ...
+    def pair(
+        self, views: Views, resolution: int, samples: int, width: float
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]: ...

@@ -18,6 +18,8 @@ from appearance_opt.render.material import evaluate, shading_normal
 from appearance_opt.render.surface import Surface, interpolate_at
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from numpy.typing import NDArray
 
     from appearance_opt.asset.types import Asset, Mesh
@@ -69,23 +71,33 @@ class MeshReference:
 
     def render(self, views: Views, resolution: int, samples: int = 16) -> NDArray[np.float32]:
         """See ``Reference.render``."""
-        return self._render(views, resolution, samples, samples**-0.5)
+        parts = self._parts(views, resolution)
+        images = [_host(self.render_device(p.records(), g, samples, samples**-0.5), g) for p, g in parts]
+        return np.concatenate(images)
 
-    def points(self, views: Views, resolution: int, width: float) -> NDArray[np.float32]:
-        """See ``PointReference.points``."""
-        return self._render(views, resolution, 1, width)
+    def pair(
+        self, views: Views, resolution: int, samples: int, width: float
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """See ``PointReference.pair``."""
+        pairs = []
+        with dr.suspend_grad():
+            for part, grid in self._parts(views, resolution):
+                both = deferred.render_pair(
+                    self.scene, self.surface, self.maps, part.records(), grid, samples, width
+                )
+                pairs.append([_host(image, grid) for image in both])
+        average, points = (np.concatenate(images) for images in zip(*pairs, strict=True))
+        return average, points
 
-    def _render(self, views: Views, resolution: int, samples: int, width: float) -> NDArray[np.float32]:
+    def _parts(self, views: Views, resolution: int) -> Iterator[tuple[Views, Grid]]:
+        """Views in batches of at most ``MAX_PIXELS`` pixels, with their grids."""
         step = max(1, MAX_PIXELS // (resolution * resolution))
-        images = []
         grid = None
         for start in range(0, len(views), step):
             part = views[start : start + step]
             if grid is None or grid.views != len(part):
                 grid = Grid(len(part), resolution)
-            image = self.render_device(part.records(), grid, samples, width)
-            images.append(np.array(image).reshape(len(part), resolution, resolution, 4))
-        return images[0] if len(images) == 1 else np.concatenate(images)
+            yield part, grid
 
     def render_device(self, records: mi.Float, grid: Grid, samples: int, width: float = 1.0) -> mi.Float:
         """The same for a batch whose records are on the device; the image stays there, flat. Textures are filtered
@@ -100,6 +112,10 @@ class MeshReference:
             hit = interpolate_at(self.surface, triangle, b1, b2, area)
             sample = evaluate(self.maps, hit)
             return SurfaceSample(sample.base_color, sample.roughness, sample.metalness, shading_normal(hit, sample))
+
+
+def _host(image: mi.Float, grid: Grid) -> NDArray[np.float32]:
+    return np.array(image).reshape(grid.views, grid.resolution, grid.resolution, 4)
 
 
 @dataclass

@@ -71,10 +71,12 @@ class ReferencePool:
     def _render(self, groups: list[int]) -> None:
         for group in groups:
             views = self.sampler.draw(group, self.batch)
-            images = self.reference.render(views, self.resolution, self.samples)
-            self._keep(self._images, group, images)
             if isinstance(self.reference, PointReference):
-                self._keep(self._points, group, self.reference.points(views, self.resolution, self.point_width))
+                images, points = self.reference.pair(views, self.resolution, self.samples, self.point_width)
+                self._keep(self._points, group, points)
+            else:
+                images = self.reference.render(views, self.resolution, self.samples)
+            self._keep(self._images, group, images)
             for k in range(self.batch):
                 self._views[group * self.batch + k] = views[k : k + 1]
 

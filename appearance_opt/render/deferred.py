@@ -6,13 +6,20 @@ surface's buffers and the texels; visibility is not (see ``silhouette`` for its 
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import drjit as dr
 import mitsuba as mi
+import numpy as np
+from scipy.ndimage import maximum_filter, minimum_filter
 
 from appearance_opt.render import brdf, material, rays
 from appearance_opt.render.material import MaterialMaps
 from appearance_opt.render.rays import Samples
 from appearance_opt.render.surface import Surface, interpolate
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
 
 class Grid:
@@ -91,3 +98,70 @@ def render_image(
         dr.scatter_reduce(dr.ReduceOp.Add, image, value, pixel_index(hits, grid.rows), mode=dr.ReduceMode.NoConflicts)
         dr.eval(image)
     return image
+
+
+DISCONTINUITY = 1.02
+"""Ratio of depths between neighbouring pixels from which an outline may pass between them."""
+
+OUTLINE_REACH = 2
+"""Pixels around an outline that are sampled finely: where a fitted shape's outline may lie meanwhile."""
+
+
+def render_pair(
+    scene: mi.Scene,
+    surface: Surface,
+    maps: MaterialMaps,
+    records: mi.Float,
+    grid: Grid,
+    samples: int,
+    width: float,
+) -> tuple[mi.Float, mi.Float]:
+    """(average, points): two images of the same views. ``points`` is what the ray through the middle of each pixel
+    sees, textures filtered over ``width`` pixels; ``average`` is the same away from outlines, and the mean of
+    ``samples`` rays near them. Costs a fraction of ``samples`` full images."""
+    hits, depth = rays.trace_depth(
+        scene, records, grid.view, mi.Float(grid.column) + 0.5, mi.Float(grid.row) + 0.5, grid.size
+    )
+    dr.eval(hits, depth)
+    points = dr.zeros(mi.Float, grid.pixels * 4)
+    _add_shaded(points, surface, maps, records, grid, rays.keep(hits, dr.compress(hits.triangle != rays.MISS)), 1, width)
+    near_outline = mi.Bool(_near_outlines(hits, depth, grid))
+    average = dr.select(dr.gather(mi.Bool, near_outline, dr.arange(mi.UInt32, grid.pixels * 4) // 4), 0, points)
+    dr.eval(average)
+    pixel = (grid.view * grid.rows + grid.row) * grid.rows + grid.column
+    index = dr.compress(dr.gather(mi.Bool, near_outline, pixel))
+    if dr.width(index):
+        fine = rays.trace_pixels(scene, records, grid.view, grid.column, grid.row, index, samples, grid.size)
+        _add_shaded(average, surface, maps, records, grid, fine, samples, samples**-0.5)
+    return average, points
+
+
+def _near_outlines(hits: Samples, depth: mi.Float, grid: Grid) -> NDArray[np.bool_]:
+    """(pixels,) pixels with a jump in depth, or a border of the object, within ``OUTLINE_REACH``."""
+    far = dr.select(hits.triangle == rays.MISS, mi.Float(1e30), depth)
+    image = dr.zeros(mi.Float, grid.pixels)
+    dr.scatter(image, far, pixel_index(hits, grid.rows), mode=dr.ReduceMode.Permute)
+    depths = np.array(image).reshape(grid.views, grid.resolution, grid.resolution)
+    size = (1, 2 * OUTLINE_REACH + 1, 2 * OUTLINE_REACH + 1)
+    return (maximum_filter(depths, size) > DISCONTINUITY * minimum_filter(depths, size)).ravel()
+
+
+def _add_shaded(
+    image: mi.Float,
+    surface: Surface,
+    maps: MaterialMaps,
+    records: mi.Float,
+    grid: Grid,
+    hits: Samples,
+    samples: int,
+    width: float,
+) -> None:
+    """Add the radiance and coverage of hits, each 1 / ``samples`` of its pixel, to an image (pixels * 4)."""
+    if dr.width(hits.triangle) == 0:
+        return
+    color = shade(surface, maps, records, hits, grid.size, dr.opaque(mi.Float, width))
+    w = dr.opaque(mi.Float, 1 / samples)
+    mode = dr.ReduceMode.NoConflicts if samples == 1 else dr.ReduceMode.Local
+    value = mi.ArrayXf([color.x * w, color.y * w, color.z * w, w])
+    dr.scatter_reduce(dr.ReduceOp.Add, image, value, pixel_index(hits, grid.rows), mode=mode)
+    dr.eval(image)

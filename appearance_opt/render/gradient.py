@@ -184,7 +184,9 @@ def _camera_samples(
         deferred = _weighted(parts, None, grid, quality.point_width)
         parts, weights = [], []
     if edges is not None:
-        parts.append(_fine_samples(scene, records, grid, dr.compress(on_edge), quality.edge_samples))
+        parts.append(rays.trace_pixels(
+                scene, records, grid.view, grid.column, grid.row, dr.compress(on_edge), quality.edge_samples, grid.size
+            ))
         weights.append(1 / quality.edge_samples)
     return _weighted(parts, weights, grid, quality.sample_width), deferred
 
@@ -203,19 +205,6 @@ def _weighted(parts: list[Samples], weights: list[float] | None, grid: Grid, wid
     weight = _joined([dr.full(mi.Float, w, dr.width(p.triangle)) for p, w in parts_weights])
     dr.eval(samples, weight, pixel)
     return Weighted(samples, pixel, weight, dr.sqrt(weight) * width)
-
-
-def _fine_samples(scene: mi.Scene, records: mi.Float, grid: Grid, index: mi.UInt32, count: int) -> Samples:
-    """The hits among ``count`` rays in each of the given pixels."""
-    offsets = mi.Float(rays.sub_pixel_offsets(count).ravel())
-    i = dr.arange(mi.UInt32, dr.width(index) * count)
-    k = i // count
-    at = dr.gather(mi.UInt32, index, k)
-    offset = 2 * (i - k * count)
-    x = mi.Float(dr.gather(mi.UInt32, grid.column, at)) + dr.gather(mi.Float, offsets, offset)
-    y = mi.Float(dr.gather(mi.UInt32, grid.row, at)) + dr.gather(mi.Float, offsets, offset + 1)
-    fine = rays.trace(scene, records, dr.gather(mi.UInt32, grid.view, at), x, y, grid.size)
-    return rays.keep(fine, dr.compress(fine.triangle != MISS))
 
 
 def _concat(parts: list[Samples]) -> Samples:

@@ -98,6 +98,28 @@ def trace_depth(
     return Samples(view, x, y, triangle), hit.t * inverse_length
 
 
+def trace_pixels(
+    scene: mi.Scene,
+    records: mi.Float,
+    view: mi.UInt32,
+    column: mi.UInt32,
+    row: mi.UInt32,
+    index: mi.UInt32,
+    count: int,
+    resolution: mi.Float,
+) -> Samples:
+    """The hits among ``count`` rays in each of the pixels at the positions ``index`` of (view, column, row)."""
+    offsets = mi.Float(sub_pixel_offsets(count).ravel())
+    i = dr.arange(mi.UInt32, dr.width(index) * count)
+    k = i // count
+    at = dr.gather(mi.UInt32, index, k)
+    offset = 2 * (i - k * count)
+    x = mi.Float(dr.gather(mi.UInt32, column, at)) + dr.gather(mi.Float, offsets, offset)
+    y = mi.Float(dr.gather(mi.UInt32, row, at)) + dr.gather(mi.Float, offsets, offset + 1)
+    fine = trace(scene, records, dr.gather(mi.UInt32, view, at), x, y, resolution)
+    return keep(fine, dr.compress(fine.triangle != MISS))
+
+
 def keep(samples: Samples, index: mi.UInt32) -> Samples:
     """The samples at the given positions of the list."""
     return Samples(
