@@ -78,6 +78,7 @@ def simplify(
     budget: Annotated[str | None, typer.Option(help="Wall-clock time for everything: 60s, 5m.")] = None,
     fit: Annotated[str | None, typer.Option(help="Subset of shape,normal,material.")] = None,
     init: Annotated[str | None, typer.Option(help="decimate, sphere, or a file to start from.")] = None,
+    reallocate: Annotated[int | None, typer.Option(help="Rounds of moving triangles to the image error.")] = None,
     loss: Annotated[str | None, typer.Option(help="log-srgb-l1, log-srgb-l2, l1, l2, smape, relative-l2.")] = None,
     laplacian: Annotated[float | None, typer.Option(help="Weight of the Laplacian (0: off).")] = None,
     relative: Annotated[

@@ -20,9 +20,9 @@ LIGHTS = ("point", "headlight")
 DEVICES = ("auto", "cpu", "cuda")
 
 PRESETS: dict[str, dict[str, Any]] = {
-    "draft": {"budget": 17.0, "resolution": 192, "pool": 64},
-    "default": {"budget": 65.0, "resolution": 256, "pool": 160},
-    "final": {"budget": 280.0, "resolution": 320, "pool": 480},
+    "draft": {"budget": 17.0, "resolution": 192, "pool": 64, "reallocate": 0},
+    "default": {"budget": 65.0, "resolution": 256, "pool": 160, "reallocate": 1},
+    "final": {"budget": 280.0, "resolution": 320, "pool": 480, "reallocate": 2},
 }
 """What each preset sets; everything else keeps its default. See docs/performance.md for how they were
 chosen."""
@@ -36,7 +36,8 @@ class SimplifyOptions:
     power of two. ``resolution``, ``views``: pixels per side and views of a step. ``steps``, ``budget`` (seconds
     for the whole job, set-up and report included): when to stop; whichever comes first. ``pool``: number of
     reference views rendered (each is used many times). ``fit``: what moves. ``init``: "decimate", "sphere", or a
-    file with a start. ``relative``: the Laplacian keeps the start's shape (a sphere start uses the absolute one
+    file with a start. ``reallocate``: rounds in which triangles are moved to where the image error of the decimated
+    mesh is. ``relative``: the Laplacian keeps the start's shape (a sphere start uses the absolute one
     unless told otherwise). ``*_rate``: learning rates, positions in units of the local edge length; by default
     they follow from how good the start is. ``keep_hidden``: keep geometry that no outside view sees.
     ``subdivision``: level for USD subdivision surfaces. Raises InputError for values that make no sense.
@@ -52,6 +53,7 @@ class SimplifyOptions:
     pool: int = 160
     fit: tuple[str, ...] = ("shape", "normal", "material")
     init: str = "decimate"
+    reallocate: int = 1
     loss: str = "log-srgb-l1"
     laplacian: float = 0.25
     relative: bool | None = None
@@ -81,6 +83,7 @@ class SimplifyOptions:
         _require(self.steps is None or self.steps >= 0, "steps", self.steps, "0 or more")
         _require(self.budget is None or self.budget > 0, "budget", self.budget, "a positive time such as 60s")
         _require(0 <= self.subdivision <= 5, "subdivision", self.subdivision, "from 0 to 5")
+        _require(0 <= self.reallocate <= 10, "reallocate", self.reallocate, "from 0 to 10")
         _require(self.laplacian >= 0, "laplacian", self.laplacian, "0 or more")
         for name in ("position_rate", "normal_rate", "color_rate", "material_rate"):
             rate = getattr(self, name)

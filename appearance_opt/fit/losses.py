@@ -83,7 +83,12 @@ def loss_of_name(name: str) -> Loss:
 
 
 def covered_loss(
-    loss: Loss, color: mi.Color3f, pixel: mi.UInt32, reference: mi.Float, background: mi.Float, pixels_per_view: int | mi.UInt32
+    loss: Loss,
+    color: mi.Color3f,
+    pixel: mi.UInt32,
+    reference: mi.Float,
+    background: mi.Float,
+    pixels_per_view: int | mi.UInt32,
 ) -> mi.Float:
     """Share of the mean loss of a batch that falls on fully covered pixels of radiance ``color``, one value per
     pixel, differentiable. The other arguments as for ``image_loss``."""

@@ -30,11 +30,9 @@ log = logging.getLogger(__name__)
 VALIDATION_VIEWS = 8
 CHECKPOINT_SECONDS = 10.0
 
-POOL_SAMPLES = 4
-"""Rays per pixel of the reference's images."""
-
-GOOD_START = 28.0
-"""Held-out PSNR (dB) of a start from which on every pixel is worth four samples."""
+POOL_SAMPLES = 32
+"""Rays per pixel of the reference's images where outlines pass: the coverage of the latent's pixels is exact, so
+that of the reference's should be, too."""
 
 EXPORT_SECONDS = 1.0
 """Time kept back from the budget for writing the result; the report has a reserve of its own."""
@@ -213,19 +211,15 @@ class _Job:
 def effort(psnr: float, likeness: bool) -> tuple[Quality, Rates]:
     """Sampling and learning rates for a start of the given held-out PSNR (dB).
 
-    A good start is easily spoilt: large steps undo it before they find something better, and the aliasing
-    of one sample per pixel, small beside the error of a poor start, biases the fit towards flat maps.
-    ``likeness``: False for a start that knows nothing (a sphere).
+    A good start is easily spoilt: large steps undo it before they find something better. ``likeness``: False for a start that knows nothing (a sphere).
     """
     from appearance_opt.fit.model import Rates
     from appearance_opt.render.gradient import Quality
 
     if not likeness:
         return Quality(1.0, 4, 1), Rates(0.05, 0.01, 0.02, 0.01)
-    factor = float(np.clip(10 ** ((25.0 - psnr) / 30.0), 0.3, 1.3))
-    rate = 0.003 * factor
-    quality = Quality(1.0, 8, 1) if psnr < GOOD_START else Quality(1.0, 16, 4, sample_width=1.0)
-    return quality, Rates(rate, rate, rate, rate)
+    rate = 0.006 * float(np.clip(10 ** ((25.0 - psnr) / 30.0), 0.25, 1.0))
+    return Quality(), Rates(rate, rate, rate, rate)
 
 
 def clean_maps(model, known: NDArray) -> dict:

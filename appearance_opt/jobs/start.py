@@ -12,12 +12,15 @@ import numpy as np
 from appearance_opt.errors import InputError
 from appearance_opt.initial.atlas import unwrap
 from appearance_opt.initial.decimate import decimate
+from appearance_opt.initial.reallocate import StartError, weights
 from appearance_opt.initial.sphere import random_maps, sphere
 from appearance_opt.initial.transfer import transfer
 from appearance_opt.initial.visibility import importance, pixel_counts
 from appearance_opt.latent.latent import LatentMesh
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from numpy.typing import NDArray
 
     from appearance_opt.config import SimplifyOptions
@@ -60,16 +63,45 @@ def make_start(reference: MeshReference, options: SimplifyOptions, sampler: View
         return Start(mesh, {**maps}, False, np.zeros((size, size), bool))
     merged = reference.merged
     faces = merged.faces
-    weight = None
+    visible = np.ones(len(faces), bool)
+    weight = np.ones(len(faces))
     if not options.keep_hidden:
         counts = pixel_counts(reference.scene, len(faces), sampler.held_out(2), VISIBILITY_VIEWS)
-        weight, visible = importance(merged.positions, faces, counts)
-        if visible.sum() >= triangles:
-            faces, weight = faces[visible], weight[visible]
-    positions, low = decimate(merged.positions, faces, triangles, weight)
-    if not len(low):
-        raise InputError("nothing is left of this mesh at that budget; ask for more triangles")
-    return transferred(reference, unwrap(positions, low, size), size)
+        weight, seen = importance(merged.positions, faces, counts)
+        visible = seen if seen.sum() >= triangles else visible
+
+    def decimated(weight: NDArray) -> Start:
+        positions, low = decimate(merged.positions, faces[visible], triangles, weight[visible])
+        if not len(low):
+            raise InputError("nothing is left of this mesh at that budget; ask for more triangles")
+        return transferred(reference, unwrap(positions, low, size), size)
+
+    start = decimated(weight)
+    if not options.reallocate:
+        return start
+    return _reallocated(start, weight, visible, decimated, reference, sampler.held_out(3), options.reallocate)
+
+
+def _reallocated(
+    start: Start,
+    weight: NDArray,
+    visible: NDArray[np.bool_],
+    decimated: Callable[[NDArray], Start],
+    reference: MeshReference,
+    sampler: ViewSampler,
+    rounds: int,
+) -> Start:
+    """The best of a start and those with triangles moved to where its image error is."""
+    judge = StartError(reference, sampler)
+    best, (error, by_face) = start, judge.measure(start.mesh, start.maps)
+    for number in range(1, rounds + 1):
+        weight = weight * weights(reference.merged.positions, reference.merged.faces, by_face, visible)
+        candidate = decimated(weight)
+        again, by_face = judge.measure(candidate.mesh, candidate.maps)
+        log.info("triangles moved, round %d: squared error of the start %.3g -> %.3g", number, error, again)
+        if again < error:
+            best, error = candidate, again
+    return best
 
 
 def transferred(reference: MeshReference, mesh: LatentMesh, size: int) -> Start:

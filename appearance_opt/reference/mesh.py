@@ -82,9 +82,7 @@ class MeshReference:
         pairs = []
         with dr.suspend_grad():
             for part, grid in self._parts(views, resolution):
-                both = deferred.render_pair(
-                    self.scene, self.surface, self.maps, part.records(), grid, samples, width
-                )
+                both = deferred.render_pair(self.scene, self.surface, self.maps, part.records(), grid, samples, width)
                 pairs.append([_host(image, grid) for image in both])
         average, points = (np.concatenate(images) for images in zip(*pairs, strict=True))
         return average, points

@@ -124,7 +124,9 @@ def render_pair(
     )
     dr.eval(hits, depth)
     points = dr.zeros(mi.Float, grid.pixels * 4)
-    _add_shaded(points, surface, maps, records, grid, rays.keep(hits, dr.compress(hits.triangle != rays.MISS)), 1, width)
+    _add_shaded(
+        points, surface, maps, records, grid, rays.keep(hits, dr.compress(hits.triangle != rays.MISS)), 1, width
+    )
     near_outline = mi.Bool(_near_outlines(hits, depth, grid))
     average = dr.select(dr.gather(mi.Bool, near_outline, dr.arange(mi.UInt32, grid.pixels * 4) // 4), 0, points)
     dr.eval(average)

@@ -41,7 +41,7 @@ class Quality:
     edge_density: float = 1.0
     edge_samples: int = 8
     samples: int = 1
-    sample_width: float = 0.7
+    sample_width: float = 1.0
     point_width: float = 0.4
 
 
@@ -184,9 +184,11 @@ def _camera_samples(
         deferred = _weighted(parts, None, grid, quality.point_width)
         parts, weights = [], []
     if edges is not None:
-        parts.append(rays.trace_pixels(
+        parts.append(
+            rays.trace_pixels(
                 scene, records, grid.view, grid.column, grid.row, dr.compress(on_edge), quality.edge_samples, grid.size
-            ))
+            )
+        )
         weights.append(1 / quality.edge_samples)
     return _weighted(parts, weights, grid, quality.sample_width), deferred
 
