@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from appearance_opt.asset.types import Asset, Material, Mesh, Texture
+from appearance_opt.asset.types import Asset, Displacement, Material, Mesh, Texture
 from appearance_opt.errors import InputError
 
-__all__ = ["Asset", "Material", "Mesh", "Texture", "load", "save"]
+__all__ = ["Asset", "Displacement", "Material", "Mesh", "Texture", "load", "save"]
 
 READABLE = (".glb", ".gltf", ".usd", ".usda", ".usdc", ".usdz", ".obj", ".ply", ".stl")
 WRITABLE = (".glb", ".gltf", ".usd", ".usda", ".usdc", ".usdz", ".obj")

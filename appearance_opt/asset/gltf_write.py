@@ -7,26 +7,35 @@ import struct
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from urllib.parse import quote
 
 import numpy as np
 
 from appearance_opt.asset import images
+from appearance_opt.asset.height import as_16_bit, height_png
 from appearance_opt.asset.paths import replacing
 from appearance_opt.asset.types import linear_to_srgb
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from appearance_opt.asset.types import Asset, Material, Mesh, Texture
+    from appearance_opt.asset.types import Asset, Displacement, Material, Mesh, Texture
 
 _WRAPS = {"repeat": 10497, "clamp": 33071, "mirror": 33648}
 _ARRAY_BUFFER, _ELEMENT_BUFFER = 34962, 34963
 
 
 def save_gltf(asset: Asset, path: Path) -> None:
-    """Write .glb (one file) or .gltf (geometry in ``<stem>.bin``, textures in ``<stem>_<k>.png``)."""
+    """Write .glb (one file) or .gltf (geometry in ``<stem>.bin``, textures in ``<stem>_<k>.png``).
+
+    glTF has no displacement: a height map goes to ``<stem>_displacement.png`` (16 bit), and the extras of
+    its materials name it, its scale and its mid-level.
+    """
     path = Path(path)
-    writer = _Writer(asset)
+    writer = _Writer(asset, path.stem)
+    for name, data in writer.companions.items():
+        with replacing(path.with_name(name)) as temporary:
+            temporary.write_bytes(data)
     if path.suffix.lower() == ".glb":
         writer.embed_images()
         with replacing(path) as temporary:
@@ -46,8 +55,11 @@ def save_gltf(asset: Asset, path: Path) -> None:
 class _Writer:
     """Collects the JSON and the binary buffer of a file."""
 
-    def __init__(self, asset: Asset) -> None:
+    def __init__(self, asset: Asset, stem: str) -> None:
         self.binary = bytearray()
+        self.stem = stem
+        self.companions: dict[str, bytes] = {}
+        self._displacements: dict[int, str] = {}
         self.json: dict[str, Any] = {
             "asset": {"version": "2.0", "generator": "appearance-opt"},
             "scene": 0,
@@ -142,11 +154,24 @@ class _Writer:
         out: dict[str, Any] = {"name": m.name, "pbrMetallicRoughness": pbr, "doubleSided": m.double_sided}
         if m.normal_texture is not None:
             out["normalTexture"] = {"index": self._texture(m.normal_texture), "scale": m.normal_scale}
+        if m.orm_texture is not None and m.has_occlusion:
+            out["occlusionTexture"] = {"index": self._texture(m.orm_texture)}
+        if m.displacement is not None:
+            out["extras"] = {"displacement": self._displacement(m.displacement)}
         if m.alpha_mode != "opaque":
             out["alphaMode"] = m.alpha_mode.upper()
             if m.alpha_mode == "mask":
                 out["alphaCutoff"] = m.alpha_cutoff
         return out
+
+    def _displacement(self, given: Displacement) -> dict[str, Any]:
+        d = as_16_bit(given)
+        if id(given) not in self._displacements:
+            name = f"{self.stem}_displacement{len(self.companions) or ''}.png"
+            self._displacements[id(given)] = name
+            self.companions[name] = height_png(d)
+        uri = quote(self._displacements[id(given)])
+        return {"uri": uri, "scale": d.scale, "midLevel": d.mid, "texCoord": 0, "unit": "metre"}
 
     def _texture(self, texture: Texture) -> int:
         if id(texture) not in self._textures:

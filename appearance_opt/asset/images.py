@@ -11,6 +11,8 @@ import numpy as np
 from appearance_opt.errors import InputError
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from numpy.typing import NDArray
 
 MAX_SIZE = 16384
@@ -67,20 +69,39 @@ def _read(source, name: str) -> NDArray:
     return pixels
 
 
-def encode_png(pixels: NDArray) -> bytes:
-    """PNG file of (H, W, C) uint8 or uint16 pixels. Fast compression: a texture is written more often
-    than it is shipped."""
+def encode_png(pixels: NDArray, attributes: Mapping[str, float | str] | None = None) -> bytes:
+    """PNG file of (H, W, C) uint8 or uint16 pixels, ``attributes`` as text chunks. Fast compression: a
+    texture is written more often than it is shipped."""
     import OpenImageIO as oiio
 
     height, width, channels = pixels.shape
     spec = oiio.ImageSpec(width, height, channels, oiio.UINT16 if pixels.dtype == np.uint16 else oiio.UINT8)
     spec.attribute("png:compressionLevel", 3)
     spec.attribute("oiio:UnassociatedAlpha", 1)
+    return _encode(np.ascontiguousarray(pixels), spec, ".png", attributes)
+
+
+def encode_exr(pixels: NDArray, attributes: Mapping[str, float | str] | None = None) -> bytes:
+    """OpenEXR file (32-bit float, lossless zip) of (H, W, C) linear pixels, with header attributes."""
+    import OpenImageIO as oiio
+
+    height, width, channels = pixels.shape
+    spec = oiio.ImageSpec(width, height, channels, oiio.FLOAT)
+    spec.attribute("compression", "zip")
+    return _encode(np.ascontiguousarray(pixels, np.float32), spec, ".exr", attributes)
+
+
+def _encode(pixels: NDArray, spec, suffix: str, attributes: Mapping[str, float | str] | None) -> bytes:
+    import OpenImageIO as oiio
+
+    for name, value in (attributes or {}).items():
+        # PNG keeps text alone
+        spec.attribute(name, f"{value:.9g}" if suffix == ".png" and not isinstance(value, str) else value)
     with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "image.png"
+        path = Path(folder) / ("image" + suffix)
         out = oiio.ImageOutput.create(str(path))
-        if out is None or not out.open(str(path), spec) or not out.write_image(np.ascontiguousarray(pixels)):
-            raise OSError(f"cannot encode a PNG image: {oiio.geterror()}")
+        if out is None or not out.open(str(path), spec) or not out.write_image(pixels):
+            raise OSError(f"cannot encode a {suffix} image: {oiio.geterror()}")
         out.close()
         return path.read_bytes()
 

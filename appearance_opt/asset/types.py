@@ -59,12 +59,25 @@ class Texture:
 
 
 @dataclass(frozen=True)
+class Displacement:
+    """A height map: the surface moves by ``scale * (texel - mid)`` metres along its unit normal.
+
+    ``texture``: one linear channel, uint16 (0 to 65535 stand for 0 to 1) or float32 (any value).
+    """
+
+    texture: Texture
+    scale: float = 1.0
+    mid: float = 0.0
+
+
+@dataclass(frozen=True)
 class Material:
     """glTF 2.0 metallic-roughness material (what a texture gives is multiplied by its factor).
 
-    ``base_color``: linear RGB factor. ``orm_texture``: R occlusion (kept, not used), G roughness,
-    B metalness, as glTF packs them. ``opacity``/``alpha_mode``/``alpha_cutoff`` are carried for
-    later use; opaque rendering ignores them.
+    ``base_color``: linear RGB factor. ``orm_texture``: R occlusion (not used by the renderer; written as
+    occlusion if ``has_occlusion``), G roughness, B metalness, as glTF packs them. ``displacement`` is
+    written where a format has it; no renderer here reads it. ``opacity``/``alpha_mode``/``alpha_cutoff``
+    are carried for later use; opaque rendering ignores them.
     """
 
     name: str = "material"
@@ -75,6 +88,8 @@ class Material:
     base_color_texture: Texture | None = None
     orm_texture: Texture | None = None
     normal_texture: Texture | None = None
+    displacement: Displacement | None = None
+    has_occlusion: bool = False
     opacity: float = 1.0
     alpha_mode: AlphaMode = "opaque"
     alpha_cutoff: float = 0.5

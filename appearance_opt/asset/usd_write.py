@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from appearance_opt.asset import images
+from appearance_opt.asset.height import as_16_bit, height_png
 from appearance_opt.asset.paths import replacing
 from appearance_opt.asset.types import linear_to_srgb
 
@@ -105,10 +106,10 @@ def _material(stage: Any, target: str, m: Material, folder: Path) -> Any:
     reader.CreateInput("varname", types.String).Set("st")
     stem = target.rsplit("/", 1)[1]
 
-    def sampler(key: str, texture: Texture, space: str) -> Any:
+    def sampler(key: str, texture: Texture, space: str, data: bytes | None = None) -> Any:
         file = folder / f"{stem}_{key}.png"
         folder.mkdir(exist_ok=True)
-        file.write_bytes(images.encode_png(_stored(texture)))
+        file.write_bytes(images.encode_png(_stored(texture)) if data is None else data)
         node = UsdShade.Shader.Define(stage, f"{target}/{key}")
         node.CreateIdAttr("UsdUVTexture")
         node.CreateInput("file", types.Asset).Set(Sdf.AssetPath(f"./{folder.name}/{file.name}"))
@@ -133,6 +134,8 @@ def _material(stage: Any, target: str, m: Material, folder: Path) -> Any:
             node.CreateInput("scale", types.Float4).Set(Gf.Vec4f(1.0, m.roughness, m.metalness, 1.0))
         roughness.ConnectToSource(node.ConnectableAPI(), "g")
         metallic.ConnectToSource(node.ConnectableAPI(), "b")
+        if m.has_occlusion:
+            shader.CreateInput("occlusion", types.Float).ConnectToSource(node.ConnectableAPI(), "r")
     else:
         roughness.Set(m.roughness)
         metallic.Set(m.metalness)
@@ -141,6 +144,14 @@ def _material(stage: Any, target: str, m: Material, folder: Path) -> Any:
         node.CreateInput("scale", types.Float4).Set(Gf.Vec4f(2 * m.normal_scale, 2 * m.normal_scale, 2, 1))
         node.CreateInput("bias", types.Float4).Set(Gf.Vec4f(-m.normal_scale, -m.normal_scale, -1, 0))
         shader.CreateInput("normal", types.Normal3f).ConnectToSource(node.ConnectableAPI(), "rgb")
+    if m.displacement is not None:
+        d = as_16_bit(m.displacement)
+        scale, mid = d.scale, d.mid
+        node = sampler("displacement", d.texture, "raw", height_png(d))
+        node.CreateInput("scale", types.Float4).Set(Gf.Vec4f(scale, scale, scale, 1))
+        node.CreateInput("bias", types.Float4).Set(Gf.Vec4f(-mid * scale, -mid * scale, -mid * scale, 0))
+        shader.CreateInput("displacement", types.Float).ConnectToSource(node.ConnectableAPI(), "r")
+        material.CreateDisplacementOutput().ConnectToSource(shader.ConnectableAPI(), "displacement")
     return material
 
 
