@@ -92,7 +92,7 @@ def simplify(
     light: Annotated[str | None, typer.Option(help="point (random) or headlight.")] = None,
     seed: Annotated[int | None, typer.Option(help="Seed of views and lights.")] = None,
     keep_hidden: Annotated[bool | None, typer.Option(help="Keep geometry that nobody sees.")] = None,
-    subdivision: Annotated[int | None, typer.Option(help="Level of USD subdivision surfaces.")] = None,
+    refine: Annotated[int | None, typer.Option(help="Level to which USD subdivision surfaces are refined.")] = None,
     variant: Annotated[list[str] | None, typer.Option(help="USD variant: set=name (repeatable).")] = None,
     device: Annotated[str | None, typer.Option(help="auto, cpu or cuda.")] = None,
     report: Annotated[Path | None, typer.Option(help="Folder for the report [OUT's name + .report].")] = None,
@@ -121,7 +121,7 @@ def simplify(
     from appearance_opt.progress import TerminalProgress
 
     check_paths(source, out)
-    asset = load(source, subdivision=options.subdivision, variants=_variants(variant))
+    asset = load(source, refine=options.refine, variants=_variants(variant))
     folder = None if no_report else report or out.with_name(out.stem + ".report")
     with TerminalProgress() as progress:
         result = run(asset, out, options, report=folder, checkpoint=checkpoint, resume=resume, progress=progress)
@@ -166,7 +166,7 @@ def compare(
 def inspect(
     source: Annotated[Path, typer.Argument(metavar="INPUT", help=".glb .gltf .usd* .obj .ply .stl")],
     as_json: Annotated[bool, typer.Option("--json", help="Print as JSON.")] = False,
-    subdivision: Annotated[int, typer.Option(help="Level of USD subdivision surfaces.")] = 1,
+    refine: Annotated[int, typer.Option(help="Level to which USD subdivision surfaces are refined.")] = 1,
     variant: Annotated[list[str] | None, typer.Option(help="USD variant: set=name (repeatable).")] = None,
 ) -> None:
     """Say what is in an asset and what is wrong with it."""
@@ -175,7 +175,7 @@ def inspect(
     from appearance_opt.asset import load
     from appearance_opt.asset.validate import validate
 
-    asset = load(source, subdivision=subdivision, variants=_variants(variant))
+    asset = load(source, refine=refine, variants=_variants(variant))
     found = {"meshes": len(asset.meshes), **asdict(validate(asset)), "notes": list(asset.notes)}
     if as_json:
         import json

@@ -40,7 +40,7 @@ class SimplifyOptions:
     mesh is. ``relative``: the Laplacian keeps the start's shape (a sphere start uses the absolute one
     unless told otherwise). ``*_rate``: learning rates, positions in units of the local edge length; by default
     they follow from how good the start is. ``keep_hidden``: keep geometry that no outside view sees.
-    ``subdivision``: level for USD subdivision surfaces. Raises InputError for values that make no sense.
+    ``refine``: level for USD subdivision surfaces. Raises InputError for values that make no sense.
     """
 
     triangles: int | None = None
@@ -65,7 +65,7 @@ class SimplifyOptions:
     light: str = "point"
     seed: int = 0
     keep_hidden: bool = False
-    subdivision: int = 1
+    refine: int = 1
     device: str = "auto"
 
     def __post_init__(self) -> None:
@@ -82,7 +82,7 @@ class SimplifyOptions:
         _require(self.pool >= self.views, "pool", self.pool, "at least as many as --views")
         _require(self.steps is None or self.steps >= 0, "steps", self.steps, "0 or more")
         _require(self.budget is None or self.budget > 0, "budget", self.budget, "a positive time such as 60s")
-        _require(0 <= self.subdivision <= 5, "subdivision", self.subdivision, "from 0 to 5")
+        _require(0 <= self.refine <= 5, "refine", self.refine, "from 0 to 5")
         _require(0 <= self.reallocate <= 10, "reallocate", self.reallocate, "from 0 to 10")
         _require(self.laplacian >= 0, "laplacian", self.laplacian, "0 or more")
         for name in ("position_rate", "normal_rate", "color_rate", "material_rate"):

@@ -13,10 +13,10 @@ READABLE = (".glb", ".gltf", ".usd", ".usda", ".usdc", ".usdz", ".obj", ".ply", 
 WRITABLE = (".glb", ".gltf", ".usd", ".usda", ".usdc", ".usdz", ".obj")
 
 
-def load(path: str | Path, *, subdivision: int = 1, variants: dict[str, str] | None = None) -> Asset:
+def load(path: str | Path, *, refine: int = 1, variants: dict[str, str] | None = None) -> Asset:
     """Read an asset; the suffix chooses the format. Units become metres, the up axis +Y.
 
-    ``subdivision``: level to which USD subdivision surfaces are refined. ``variants``: USD variant
+    ``refine``: level to which USD subdivision surfaces are refined. ``variants``: USD variant
     selections by set name, instead of those in the file. Harmless faults are repaired
     and noted in ``Asset.notes``. Raises InputError for everything else, naming the file.
     """
@@ -28,10 +28,10 @@ def load(path: str | Path, *, subdivision: int = 1, variants: dict[str, str] | N
         raise InputError(f"{path}: no such file")
     from appearance_opt.asset.validate import repair
 
-    return repair(_read(path, suffix, subdivision, variants), str(path))
+    return repair(_read(path, suffix, refine, variants), str(path))
 
 
-def _read(path: Path, suffix: str, subdivision: int, variants: dict[str, str] | None) -> Asset:
+def _read(path: Path, suffix: str, refine: int, variants: dict[str, str] | None) -> Asset:
     if suffix in (".glb", ".gltf"):
         from appearance_opt.asset.gltf_read import load_gltf
 
@@ -46,7 +46,7 @@ def _read(path: Path, suffix: str, subdivision: int, variants: dict[str, str] | 
         return load_geometry(path)
     from appearance_opt.asset.usd_read import load_usd
 
-    return load_usd(path, subdivision, variants)
+    return load_usd(path, refine, variants)
 
 
 def save(asset: Asset, path: str | Path) -> None:

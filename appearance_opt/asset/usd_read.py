@@ -23,9 +23,9 @@ _TO_Y_UP = {
 }
 
 
-def load_usd(path: Path, subdivision: int = 1, variants: dict[str, str] | None = None) -> Asset:
+def load_usd(path: Path, refine: int = 1, variants: dict[str, str] | None = None) -> Asset:
     """Read a stage at its default time, variants at their selection (or as ``variants`` says: set name ->
-    variant, on the default prim). Catmull-Clark and Loop meshes are refined ``subdivision`` times. Raises
+    variant, on the default prim). Catmull-Clark and Loop meshes are refined ``refine`` times. Raises
     InputError."""
     from pxr import Tf, Usd
 
@@ -39,7 +39,7 @@ def load_usd(path: Path, subdivision: int = 1, variants: dict[str, str] | None =
         raise InputError(f"{path}: not a readable USD file")
     _select(stage, variants or {}, path)
     _refuse_escapes(stage, path)
-    return _Reader(stage, path, subdivision).asset()
+    return _Reader(stage, path, refine).asset()
 
 
 def _select(stage: Any, variants: dict[str, str], path: Path) -> None:
@@ -65,10 +65,10 @@ def _refuse_escapes(stage: Any, path: Path) -> None:
 
 
 class _Reader:
-    def __init__(self, stage: Any, path: Path, subdivision: int) -> None:
+    def __init__(self, stage: Any, path: Path, refine: int) -> None:
         from pxr import UsdGeom
 
-        self.stage, self.path, self.subdivision = stage, path, subdivision
+        self.stage, self.path, self.refine = stage, path, refine
         self.notes: list[str] = []
         self.up = str(UsdGeom.GetStageUpAxis(stage))
         self.unit = float(UsdGeom.GetStageMetersPerUnit(stage))
@@ -114,11 +114,11 @@ class _Reader:
         for name, (value, where) in self._primvars(prim, mesh, polygons).items():
             values[name] = (value, where)
         scheme = str(mesh.GetSubdivisionSchemeAttr().Get())
-        if scheme in ("catmullClark", "loop") and self.subdivision > 0:
+        if scheme in ("catmullClark", "loop") and self.refine > 0:
             values.pop("normals", None)
             if scheme == "loop":
                 self._note("Loop subdivision surfaces are refined by the rules of Catmull-Clark")
-            for _ in range(self.subdivision):
+            for _ in range(self.refine):
                 face_ids = np.repeat(face_ids, values["points"][1].counts)
                 values = {n: catmull_clark(v, p, n == "uvs") for n, (v, p) in values.items()}
         flipped = str(mesh.GetOrientationAttr().Get()) == "leftHanded"

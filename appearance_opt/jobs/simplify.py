@@ -94,7 +94,7 @@ def simplify(
     watch = Stopwatch()
     if out is not None:
         check_paths(Path(source) if isinstance(source, (str, Path)) else None, Path(out))
-    asset = load(source, subdivision=options.subdivision) if isinstance(source, (str, Path)) else source
+    asset = load(source, refine=options.refine) if isinstance(source, (str, Path)) else source
     watch.lap("load")
     backend.select(options.device)
     run = _Job(asset, options, watch)

@@ -120,7 +120,7 @@ def loaded_start(
     from appearance_opt.asset import load
     from appearance_opt.asset.normals import weld
 
-    asset = load(path, subdivision=options.subdivision)
+    asset = load(path, refine=options.refine)
     offsets = np.cumsum([0] + [len(m.positions) for m in asset.meshes[:-1]])
     p = np.concatenate([m.positions for m in asset.meshes]).astype(np.float64)
     f = np.concatenate([m.faces + o for m, o in zip(asset.meshes, offsets, strict=True)])
