@@ -6,8 +6,9 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from appearance_opt.asset import load, save
-    from appearance_opt.config import SimplifyOptions, simplify_options
+    from appearance_opt.config import BakeOptions, SimplifyOptions, bake_options, simplify_options
     from appearance_opt.errors import AppearanceError, BackendError, DivergedError, InputError, ReferenceRenderError
+    from appearance_opt.jobs.bake import bake
     from appearance_opt.jobs.compare import compare
     from appearance_opt.jobs.simplify import simplify
 
@@ -16,10 +17,13 @@ __version__ = "0.1.0"
 _HOMES = {
     "AppearanceError": "appearance_opt.errors",
     "BackendError": "appearance_opt.errors",
+    "BakeOptions": "appearance_opt.config",
     "DivergedError": "appearance_opt.errors",
     "InputError": "appearance_opt.errors",
     "ReferenceRenderError": "appearance_opt.errors",
     "SimplifyOptions": "appearance_opt.config",
+    "bake": "appearance_opt.jobs.bake",
+    "bake_options": "appearance_opt.config",
     "compare": "appearance_opt.jobs.compare",
     "load": "appearance_opt.asset",
     "save": "appearance_opt.asset",
@@ -30,10 +34,13 @@ _HOMES = {
 __all__ = [
     "AppearanceError",
     "BackendError",
+    "BakeOptions",
     "DivergedError",
     "InputError",
     "ReferenceRenderError",
     "SimplifyOptions",
+    "bake",
+    "bake_options",
     "compare",
     "load",
     "save",

@@ -135,6 +135,81 @@ def simplify(
 
 
 @app.command()
+def bake(
+    high: Annotated[Path, typer.Argument(metavar="HIGH", help="What it shall look like.")],
+    low: Annotated[Path, typer.Argument(metavar="LOW", help="Keeps its shape and its texture coordinates.")],
+    out: Annotated[Path, typer.Option(help="Result: .glb .gltf .usd* .obj")],
+    maps: Annotated[
+        str | None,
+        typer.Option(help="normal,material,base-color,orm,displacement,object-normal,ao,curvature."),
+    ] = None,
+    closed_form: Annotated[bool | None, typer.Option("--closed-form", help="Rays alone, no fit: seconds.")] = None,
+    fit: Annotated[str | None, typer.Option(help="Subset of normal,material.")] = None,
+    preset: Annotated[str | None, typer.Option(help="draft, default or final.")] = None,
+    texture_size: Annotated[int | None, typer.Option(help="Texels per side of the maps (power of two).")] = None,
+    samples: Annotated[int | None, typer.Option(help="Rays per texel.")] = None,
+    cage: Annotated[float | None, typer.Option(help="How far rays go, metres [from the two meshes].")] = None,
+    hit: Annotated[str | None, typer.Option(help="nearest or outermost surface.")] = None,
+    green: Annotated[str | None, typer.Option(help="Green of loose normal maps: opengl or directx.")] = None,
+    bits: Annotated[int | None, typer.Option(help="8 or 16, of normal maps and loose maps.")] = None,
+    texture_format: Annotated[str | None, typer.Option(help="Of loose maps: png or exr.")] = None,
+    ao_rays: Annotated[int | None, typer.Option(help="Rays per sample of ambient occlusion.")] = None,
+    ao_distance: Annotated[float | None, typer.Option(help="Reach of ambient occlusion, metres [any].")] = None,
+    unwrap: Annotated[bool | None, typer.Option("--unwrap", help="Make a new atlas for LOW.")] = None,
+    align: Annotated[bool | None, typer.Option("--align", help="Fit HIGH to LOW: translation, scale.")] = None,
+    resolution: Annotated[int | None, typer.Option(help="Pixels per side of a training view.")] = None,
+    views: Annotated[int | None, typer.Option(help="Views per step.")] = None,
+    pool: Annotated[int | None, typer.Option(help="Reference views rendered, each used many times.")] = None,
+    steps: Annotated[int | None, typer.Option(help="Stop after this many steps.")] = None,
+    budget: Annotated[str | None, typer.Option(help="Wall-clock time for everything: 60s, 5m.")] = None,
+    loss: Annotated[str | None, typer.Option(help="As for simplify.")] = None,
+    normal_rate: Annotated[float | None, typer.Option(help="Learning rate of the normal map.")] = None,
+    color_rate: Annotated[float | None, typer.Option(help="Learning rate of the base colour.")] = None,
+    material_rate: Annotated[float | None, typer.Option(help="Learning rate of roughness, metalness.")] = None,
+    background: Annotated[str | None, typer.Option(help="random, black, white, grey or r,g,b.")] = None,
+    light: Annotated[str | None, typer.Option(help="point (random) or headlight.")] = None,
+    seed: Annotated[int | None, typer.Option(help="Seed of views and lights.")] = None,
+    refine: Annotated[int | None, typer.Option(help="Level to which USD subdivision surfaces are refined.")] = None,
+    variant: Annotated[list[str] | None, typer.Option(help="USD variant of HIGH: set=name (repeatable).")] = None,
+    device: Annotated[str | None, typer.Option(help="auto, cpu or cuda.")] = None,
+    textures: Annotated[Path | None, typer.Option(help="Folder for the maps as loose files.")] = None,
+    report: Annotated[Path | None, typer.Option(help="Folder for the report [OUT's name + .report].")] = None,
+    no_report: Annotated[bool, typer.Option("--no-report", help="Write no report.")] = False,
+    config: Annotated[Path | None, typer.Option(help="TOML file with the same keys.")] = None,
+) -> None:
+    """Bake what HIGH looks like into the maps of LOW."""
+    arguments = dict(locals())
+    from appearance_opt.config import BAKE_OPTION_NAMES, bake_options, read_toml
+
+    values: dict[str, Any] = read_toml(config, BAKE_OPTION_NAMES) if config is not None else {}
+    values.update({k: v for k, v in arguments.items() if k in BAKE_OPTION_NAMES and v is not None})
+    name = preset or values.get("preset") or "default"
+    values.pop("preset", None)
+    options = bake_options(name, **values)
+    from appearance_opt.asset import load
+    from appearance_opt.jobs.bake import bake as run
+    from appearance_opt.jobs.simplify import check_paths
+    from appearance_opt.progress import TerminalProgress
+
+    for source in (high, low):
+        check_paths(source, out)
+    heavy = load(high, refine=options.refine, variants=_variants(variant))
+    folder = None if no_report else report or out.with_name(out.stem + ".report")
+    with TerminalProgress() as progress:
+        result = run(heavy, low, out, options, report=folder, textures=textures, progress=progress)
+    for note in result.notes:
+        print(f"note: {note}", file=sys.stderr)
+    quality = ""
+    if result.fit is not None and result.fit.curve:
+        curve = result.fit.curve
+        quality = f", held-out PSNR {curve[0].psnr:.2f} -> {max(p.psnr for p in curve):.2f} dB"
+    missed = f"{100 * result.missed_share:.2f} % of the texels missed"
+    print(f"{out}: {','.join(options.maps)}, {missed}, {result.seconds['total']:.1f} s{quality}")
+    if folder is not None:
+        print(f"report: {folder / 'report.html'}")
+
+
+@app.command()
 def compare(
     reference: Annotated[Path, typer.Argument(metavar="REFERENCE")],
     candidate: Annotated[Path, typer.Argument(metavar="CANDIDATE")],

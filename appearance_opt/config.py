@@ -18,6 +18,10 @@ LOSS_NAMES = ("log-srgb-l1", "log-srgb-l2", "l1", "l2", "smape", "relative-l2")
 BACKGROUNDS = ("random", "black", "white", "grey")
 LIGHTS = ("point", "headlight")
 DEVICES = ("auto", "cpu", "cuda")
+MAPS = ("normal", "material", "base-color", "orm", "displacement", "object-normal", "ao", "curvature")
+HITS = ("nearest", "outermost")
+GREENS = ("opengl", "directx")
+TEXTURE_FORMATS = ("png", "exr")
 
 PRESETS: dict[str, dict[str, Any]] = {
     "draft": {"budget": 17.0, "resolution": 192, "pool": 64, "reallocate": 0},
@@ -29,22 +33,17 @@ chosen."""
 
 
 @dataclass(frozen=True)
-class SimplifyOptions:
-    """How to simplify.
+class CommonOptions:
+    """What all jobs that fit share.
 
-    ``triangles`` or ``ratio``: the budget (exactly one). ``texture_size``: texels per side of the new maps, a
-    power of two. ``resolution``, ``views``: pixels per side and views of a step. ``steps``, ``budget`` (seconds
-    for the whole job, set-up and report included): when to stop; whichever comes first. ``pool``: number of
-    reference views rendered (each is used many times). ``fit``: what moves. ``init``: "decimate", "sphere", or a
-    file with a start. ``reallocate``: rounds in which triangles are moved to where the image error of the decimated
-    mesh is. ``relative``: the Laplacian keeps the start's shape (a sphere start uses the absolute one
-    unless told otherwise). ``*_rate``: learning rates, positions in units of the local edge length; by default
-    they follow from how good the start is. ``keep_hidden``: keep geometry that no outside view sees.
-    ``refine``: level for USD subdivision surfaces. Raises InputError for values that make no sense.
+    ``texture_size``: texels per side of the new maps, a power of two. ``resolution``, ``views``: pixels per side and
+    views of a step. ``steps``, ``budget`` (seconds for the whole job, set-up and report included): when to stop;
+    whichever comes first. ``pool``: number of reference views rendered (each is used many times). ``fit``: what
+    moves. ``*_rate``: learning rates, positions in units of the local edge length; by default they follow from how
+    good the start is. ``refine``: level for USD subdivision surfaces. Raises InputError for values that make no
+    sense.
     """
 
-    triangles: int | None = None
-    ratio: float | None = None
     texture_size: int = 1024
     resolution: int = 256
     views: int = 4
@@ -52,11 +51,7 @@ class SimplifyOptions:
     budget: float | None = None
     pool: int = 160
     fit: tuple[str, ...] = ("shape", "normal", "material")
-    init: str = "decimate"
-    reallocate: int = 1
     loss: str = "log-srgb-l1"
-    laplacian: float = 0.25
-    relative: bool | None = None
     position_rate: float | None = None
     normal_rate: float | None = None
     color_rate: float | None = None
@@ -64,17 +59,10 @@ class SimplifyOptions:
     background: str = "random"
     light: str = "point"
     seed: int = 0
-    keep_hidden: bool = False
     refine: int = 1
     device: str = "auto"
 
     def __post_init__(self) -> None:
-        if (self.triangles is None) == (self.ratio is None):
-            raise InputError("give either --triangles N or --ratio R")
-        if self.triangles is not None:
-            _require(self.triangles >= 4, "triangles", self.triangles, "at least 4")
-        if self.ratio is not None:
-            _require(0 < self.ratio <= 1, "ratio", self.ratio, "above 0 and at most 1")
         size = self.texture_size
         _require(16 <= size <= 8192 and size & (size - 1) == 0, "texture-size", size, "a power of two from 16 to 8192")
         _require(16 <= self.resolution <= 4096, "resolution", self.resolution, "from 16 to 4096")
@@ -83,8 +71,6 @@ class SimplifyOptions:
         _require(self.steps is None or self.steps >= 0, "steps", self.steps, "0 or more")
         _require(self.budget is None or self.budget > 0, "budget", self.budget, "a positive time such as 60s")
         _require(0 <= self.refine <= 5, "refine", self.refine, "from 0 to 5")
-        _require(0 <= self.reallocate <= 10, "reallocate", self.reallocate, "from 0 to 10")
-        _require(self.laplacian >= 0, "laplacian", self.laplacian, "0 or more")
         for name in ("position_rate", "normal_rate", "color_rate", "material_rate"):
             rate = getattr(self, name)
             _require(rate is None or 0 <= rate <= 1, name.replace("_", "-"), rate, "from 0 to 1")
@@ -94,8 +80,6 @@ class SimplifyOptions:
         _choice("light", self.light, LIGHTS)
         _choice("device", self.device, DEVICES)
         self.background_color()
-        if self.init not in INITS and not Path(self.init).suffix:
-            _choice("init", self.init, INITS)
 
     def background_color(self) -> str | tuple[float, float, float]:
         """A name, or linear RGB."""
@@ -110,23 +94,112 @@ class SimplifyOptions:
         return (r, g, b)
 
 
+@dataclass(frozen=True)
+class SimplifyOptions(CommonOptions):
+    """How to simplify.
+
+    ``triangles`` or ``ratio``: the budget (exactly one). ``init``: "decimate", "sphere", or a file with a start.
+    ``reallocate``: rounds in which triangles are moved to where the image error of the decimated mesh is.
+    ``relative``: the Laplacian keeps the start's shape (a sphere start uses the absolute one unless told
+    otherwise). ``keep_hidden``: keep geometry that no outside view sees. The others: ``CommonOptions``.
+    """
+
+    triangles: int | None = None
+    ratio: float | None = None
+    init: str = "decimate"
+    reallocate: int = 1
+    laplacian: float = 0.25
+    relative: bool | None = None
+    keep_hidden: bool = False
+
+    def __post_init__(self) -> None:
+        if (self.triangles is None) == (self.ratio is None):
+            raise InputError("give either --triangles N or --ratio R")
+        if self.triangles is not None:
+            _require(self.triangles >= 4, "triangles", self.triangles, "at least 4")
+        if self.ratio is not None:
+            _require(0 < self.ratio <= 1, "ratio", self.ratio, "above 0 and at most 1")
+        super().__post_init__()
+        _require(0 <= self.reallocate <= 10, "reallocate", self.reallocate, "from 0 to 10")
+        _require(self.laplacian >= 0, "laplacian", self.laplacian, "0 or more")
+        if self.init not in INITS and not Path(self.init).suffix:
+            _choice("init", self.init, INITS)
+
+
+@dataclass(frozen=True)
+class BakeOptions(CommonOptions):
+    """How to bake.
+
+    ``maps``: any of ``MAPS``; "material" is base-color and orm. ``closed_form``: no fit. ``samples``: rays per texel.
+    ``cage``: how far rays go outward and inward (metres), by default from the two meshes. ``hit``: "nearest" or
+    "outermost" surface that faces the texel's way. ``green``: green channel of loose normal maps, "opengl" or
+    "directx". ``bits``: 8 or 16, of normal maps and of loose maps. ``texture_format``: of loose maps, png or exr.
+    ``ao_rays``, ``ao_distance`` (metres; by default any): ambient occlusion. ``unwrap``: make a new atlas for LOW.
+    ``align``: fit HIGH to LOW by translation and scale. The others: ``CommonOptions``; ``fit``: of normal,material.
+    """
+
+    maps: tuple[str, ...] = ("normal", "material")
+    fit: tuple[str, ...] = ("normal", "material")
+    closed_form: bool = False
+    samples: int = 4
+    cage: float | None = None
+    hit: str = "nearest"
+    green: str = "opengl"
+    bits: int = 8
+    texture_format: str = "png"
+    ao_rays: int = 64
+    ao_distance: float | None = None
+    unwrap: bool = False
+    align: bool = False
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _require(bool(self.maps), "maps", "", f"some of {', '.join(MAPS)}")
+        for name in self.maps:
+            _choice("maps", name, MAPS)
+        for part in self.fit:
+            _require(part in ("normal", "material"), "fit", part, "of normal,material: LOW keeps its shape")
+        _require(1 <= self.samples <= 64, "samples", self.samples, "from 1 to 64")
+        _require(self.cage is None or self.cage > 0, "cage", self.cage, "a positive distance in metres")
+        _choice("hit", self.hit, HITS)
+        _choice("green", self.green, GREENS)
+        _choice("texture-format", self.texture_format, TEXTURE_FORMATS)
+        _require(self.bits in (8, 16), "bits", self.bits, "8 or 16")
+        _require(1 <= self.ao_rays <= 4096, "ao-rays", self.ao_rays, "from 1 to 4096")
+        _require(self.ao_distance is None or self.ao_distance > 0, "ao-distance", self.ao_distance, "above 0")
+
+    def wants(self, name: str) -> bool:
+        """Is a map asked for? "material" is base-color and orm."""
+        return name in self.maps or ("material" in self.maps and name in ("base-color", "orm"))
+
+
 OPTION_NAMES = frozenset(f.name for f in fields(SimplifyOptions))
+BAKE_OPTION_NAMES = frozenset(f.name for f in fields(BakeOptions)) - {"position_rate"}
 
 
 def simplify_options(preset: str = "default", **values: Any) -> SimplifyOptions:
     """Options from a preset and what overrides it. Raises InputError for unknown names and bad values."""
+    return SimplifyOptions(**_merged(SimplifyOptions, OPTION_NAMES, preset, values))
+
+
+def bake_options(preset: str = "default", **values: Any) -> BakeOptions:
+    """The same for a bake."""
+    return BakeOptions(**_merged(BakeOptions, BAKE_OPTION_NAMES, preset, values))
+
+
+def _merged(kind: type, known: frozenset[str], preset: str, values: Mapping[str, Any]) -> dict[str, Any]:
     _choice("preset", preset, tuple(PRESETS))
     for name in values:
-        if name not in OPTION_NAMES:
-            raise InputError(_unknown(name, OPTION_NAMES))
-    merged = {**PRESETS[preset], **values}
+        if name not in known:
+            raise InputError(_unknown(name, known))
+    merged = {**{k: v for k, v in PRESETS[preset].items() if k in known}, **values}
     # an explicit number of steps replaces the preset's time budget
     if values.get("steps") is not None and "budget" not in values:
         merged["budget"] = None
-    return SimplifyOptions(**{k: _converted(k, v) for k, v in merged.items()})
+    return {k: _converted(kind, k, v) for k, v in merged.items()}
 
 
-def read_toml(path: Path) -> dict[str, Any]:
+def read_toml(path: Path, names: frozenset[str] = OPTION_NAMES) -> dict[str, Any]:
     """Keys of a job file, dashes or underscores. Raises InputError for unknown keys, suggesting the nearest."""
     if sys.version_info >= (3, 11):
         import tomllib
@@ -138,7 +211,7 @@ def read_toml(path: Path) -> dict[str, Any]:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from error
     except (ValueError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: not a valid TOML file ({error})") from error
-    known = OPTION_NAMES | {"preset"}
+    known = names | {"preset"}
     out: dict[str, Any] = {}
     for key, value in data.items():
         name = key.replace("-", "_")
@@ -158,7 +231,7 @@ def duration(text: str | float) -> float:
     return float(match[1]) * {"m": 60.0, "min": 60.0, "h": 3600.0}.get(match[2] or "s", 1.0)
 
 
-def as_dict(options: SimplifyOptions) -> dict[str, Any]:
+def as_dict(options: CommonOptions) -> dict[str, Any]:
     """Plain values, for reports and fingerprints."""
     return {f.name: getattr(options, f.name) for f in fields(options)}
 
@@ -168,14 +241,14 @@ def with_values(options: SimplifyOptions, **values: Any) -> SimplifyOptions:
     return replace(options, **values)
 
 
-def _converted(name: str, value: Any) -> Any:
+def _converted(kind: type, name: str, value: Any) -> Any:
     if name == "budget" and value is not None:
         return duration(value)
-    if name == "fit":
+    if name in ("fit", "maps"):
         parts = value.split(",") if isinstance(value, str) else value
         return tuple(dict.fromkeys(p.strip() for p in parts if p.strip()))
     kinds: Mapping[str, tuple[type, ...]] = {"int": (int,), "float": (int, float), "str": (str,), "bool": (bool,)}
-    declared = str(next(f.type for f in fields(SimplifyOptions) if f.name == name))
+    declared = str(next(f.type for f in fields(kind) if f.name == name))
     allowed = tuple(k for word, types in kinds.items() if word in declared for k in types)
     if value is None and "None" in declared:
         return None

@@ -34,13 +34,13 @@ def test_16_bits_hold_heights_to_half_a_step(heights: np.ndarray) -> None:
 
 def test_files_carry_scale_and_mid_level(heights: np.ndarray, tmp_path: Path) -> None:
     d = displacement_of(heights)
-    for name, data, scale, mid in (("h.png", height_png(d), d.scale, d.mid), ("h.exr", height_exr(d), 1.0, 0.0)):
+    for name, data, scale, mid in (("h.png", height_png(d), d.scale, d.mid), ("h.exr", height_exr(heights), 1.0, 0.0)):
         (tmp_path / name).write_bytes(data)
         spec = oiio.ImageInput.open(str(tmp_path / name)).spec()
         assert float(spec.getattribute("DisplacementScale")) == pytest.approx(scale, rel=1e-6)
         assert float(spec.getattribute("DisplacementMidLevel")) == pytest.approx(mid, rel=1e-6)
     assert decode(height_png(d), "h.png").dtype == np.uint16
-    np.testing.assert_array_equal(decode(height_exr(d), "h.exr")[..., 0], heights_of(d))
+    np.testing.assert_array_equal(decode(height_exr(heights), "h.exr")[..., 0], heights)
 
 
 def displaced(ball: Asset, heights: np.ndarray) -> Asset:

@@ -43,9 +43,9 @@ def height_png(displacement: Displacement) -> bytes:
     return images.encode_png(d.texture.pixels[..., :1], _attributes(d.scale, d.mid))
 
 
-def height_exr(displacement: Displacement) -> bytes:
-    """32-bit EXR of metres: scale 1 and mid-level 0, in the header under the same names."""
-    return images.encode_exr(heights_of(displacement)[..., None], _attributes(1.0, 0.0))
+def height_exr(heights: NDArray[np.float32]) -> bytes:
+    """32-bit EXR of (H, W) metres: scale 1 and mid-level 0, in the header under the same names."""
+    return images.encode_exr(heights[..., None], _attributes(1.0, 0.0))
 
 
 def _attributes(scale: float, mid: float) -> dict[str, float | str]:

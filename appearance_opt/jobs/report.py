@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from appearance_opt import backend
+from appearance_opt.bake.encode import coverage_picture
 from appearance_opt.config import as_dict
 from appearance_opt.evaluate import pictures
 from appearance_opt.evaluate.metrics import compare_images
@@ -21,7 +22,9 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from appearance_opt.asset.types import Asset
-    from appearance_opt.config import SimplifyOptions
+    from appearance_opt.config import BakeOptions, CommonOptions, SimplifyOptions
+    from appearance_opt.evaluate.metrics import Metrics
+    from appearance_opt.jobs.bake import BakeResult
     from appearance_opt.jobs.simplify import SimplifyResult
     from appearance_opt.views import ViewSampler
 
@@ -38,28 +41,7 @@ def write_simplify_report(
     options: SimplifyOptions,
 ) -> None:
     """Report of a simplification: start and result against the source."""
-    from appearance_opt.jobs.simplify import in_frame
-
-    views = sampler.held_out(HELD_OUT_STREAM).draw(0, VIEWS)
-    images = {
-        name: render_asset(in_frame(asset, *frame), views, RESOLUTION, SAMPLES)
-        for name, asset in (("reference", source), ("start", result.start), ("result", result.asset))
-    }
-    triangles = triangle_images(in_frame(result.asset, *frame), views[:PICTURED], 2 * RESOLUTION)
-    metrics = {n: compare_images(images["reference"], images[n]) for n in ("start", "result")}
-    per_view = []
-    for k in range(PICTURED):
-        r, s, a = (images[n][k] for n in ("reference", "start", "result"))
-        per_view.append(
-            {
-                "reference": pictures.picture(r),
-                "result": pictures.picture(a),
-                "difference x 4": pictures.difference(r, a),
-                "wireframe": pictures.wireframe(a, triangles[k]),
-                "start": pictures.picture(s),
-                "start's difference x 4": pictures.difference(r, s),
-            }
-        )
+    metrics, per_view = _measured(source, result.start, result.asset, ("start", "result"), sampler, frame)
     data = ReportData(
         title=f"{source.name}: {result.source_triangles:,} to {result.triangles:,} triangles",
         facts=_facts(result, options),
@@ -70,6 +52,74 @@ def write_simplify_report(
         notes=result.notes,
     )
     write_report(folder, data)
+
+
+def write_bake_report(
+    folder: Path,
+    high: Asset,
+    result: BakeResult,
+    sampler: ViewSampler,
+    frame: tuple[tuple[float, float, float], float],
+    options: BakeOptions,
+) -> None:
+    """Report of a bake: closed form and fit against HIGH (as it was aligned)."""
+    names = ("closed form", "fitted" if result.fit is not None else "result")
+    metrics, per_view = _measured(high, result.closed_form, result.asset, names, sampler, frame)
+    fit = result.fit
+    facts: dict[str, object] = {
+        "triangles": f"{result.asset.triangle_count} of {high.triangle_count}",
+        "missed texels": f"{100 * result.missed_share:.3f} % of {int(result.covered.sum())}",
+        "reach of the rays (m)": f"{result.reach:.6g}",
+        "seconds by stage": ", ".join(f"{k} {v:.1f}" for k, v in result.seconds.items()),
+    }
+    if fit is not None:
+        facts["steps"] = f"{fit.steps} ({fit.steps / max(fit.seconds, 1e-9):.1f} per second), best at {fit.best_step}"
+    maps = pictures.texture_pictures(result.asset)
+    maps["coverage (red: missed)"] = coverage_picture(result.covered, result.missed)
+    data = ReportData(
+        title=f"{high.name} baked to {result.asset.name}",
+        facts={**facts, **_settings(options)},
+        metrics=metrics,
+        views=per_view,
+        maps=maps,
+        curve=[] if fit is None else [(p.seconds, p.step, p.psnr, p.loss) for p in fit.curve],
+        notes=result.notes,
+    )
+    write_report(folder, data)
+
+
+def _measured(
+    source: Asset,
+    start: Asset,
+    result: Asset,
+    names: tuple[str, str],
+    sampler: ViewSampler,
+    frame: tuple[tuple[float, float, float], float],
+) -> tuple[dict[str, Metrics], list[dict[str, NDArray[np.uint8]]]]:
+    """(metrics of start and result, which ``names`` names, on held-out views of the source; pictures of some of
+    the views). One column is left out if the two are the same."""
+    from appearance_opt.jobs.simplify import in_frame
+
+    views = sampler.held_out(HELD_OUT_STREAM).draw(0, VIEWS)
+    reference, last = (render_asset(in_frame(a, *frame), views, RESOLUTION, SAMPLES) for a in (source, result))
+    first = last if start is result else render_asset(in_frame(start, *frame), views, RESOLUTION, SAMPLES)
+    triangles = triangle_images(in_frame(result, *frame), views[:PICTURED], 2 * RESOLUTION)
+    metrics = {names[0]: compare_images(reference, first)}
+    if start is not result:
+        metrics[names[1]] = compare_images(reference, last)
+    per_view = []
+    for r, s, a, t in zip(reference, first, last, triangles, strict=False):
+        shown = {
+            "reference": pictures.picture(r),
+            "result": pictures.picture(a),
+            "difference x 4": pictures.difference(r, a),
+            "wireframe": pictures.wireframe(a, t),
+        }
+        if start is not result:
+            shown[names[0]] = pictures.picture(s)
+            shown[f"{names[0]}'s difference x 4"] = pictures.difference(r, s)
+        per_view.append(shown)
+    return metrics, per_view
 
 
 def write_compare_report(folder: Path, reference: Asset, candidate: Asset, result: Comparison) -> None:
@@ -113,6 +163,12 @@ def _facts(result: SimplifyResult, options: SimplifyOptions) -> dict[str, object
         "skipped steps": fit.skipped,
         "seconds by stage": ", ".join(f"{k} {v:.1f}" for k, v in result.seconds.items()),
     }
-    facts.update({f"option {k.replace('_', ' ')}": v for k, v in as_dict(options).items() if v is not None})
+    return {**facts, **_settings(options)}
+
+
+def _settings(options: CommonOptions) -> dict[str, object]:
+    facts: dict[str, object] = {
+        f"option {k.replace('_', ' ')}": v for k, v in as_dict(options).items() if v is not None
+    }
     facts.update({f"version of {k}": v for k, v in backend.versions().items()})
     return facts

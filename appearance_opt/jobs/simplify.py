@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
-import time
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -22,22 +21,11 @@ if TYPE_CHECKING:
 
     from appearance_opt.asset.types import Asset
     from appearance_opt.fit.loop import FitResult, Progress
-    from appearance_opt.fit.model import Rates
-    from appearance_opt.render.gradient import Quality
+    from appearance_opt.jobs.fitting import Stopwatch
 
 log = logging.getLogger(__name__)
 
-VALIDATION_VIEWS = 8
 CHECKPOINT_SECONDS = 10.0
-
-POOL_SAMPLES = 32
-"""Rays per pixel of the reference's images where outlines pass: the coverage of the latent's pixels is exact, so
-that of the reference's should be, too."""
-
-EXPORT_SECONDS = 1.0
-"""Time kept back from the budget for writing the result; the report has a reserve of its own."""
-
-REPORT_SECONDS = 5.0
 
 
 @dataclass
@@ -56,25 +44,6 @@ class SimplifyResult:
     error: DivergedError | None = None
 
 
-class Stopwatch:
-    """Seconds by stage."""
-
-    def __init__(self) -> None:
-        self.began = self._last = time.perf_counter()
-        self.stages: dict[str, float] = {}
-
-    def lap(self, stage: str) -> None:
-        """Everything since the last lap was ``stage``."""
-        now = time.perf_counter()
-        self.stages[stage] = self.stages.get(stage, 0.0) + now - self._last
-        self._last = now
-
-    @property
-    def total(self) -> float:
-        """Seconds since the start."""
-        return time.perf_counter() - self.began
-
-
 def simplify(
     source: str | Path | Asset,
     out: str | Path | None,
@@ -91,6 +60,8 @@ def simplify(
     every few seconds; with ``resume`` a run goes on from there. Ctrl-C ends the fit early and still
     writes the best state so far. Raises AppearanceError.
     """
+    from appearance_opt.jobs.fitting import Stopwatch
+
     watch = Stopwatch()
     if out is not None:
         check_paths(Path(source) if isinstance(source, (str, Path)) else None, Path(out))
@@ -151,43 +122,22 @@ class _Job:
         watch.lap("start")
 
     def fit(self, progress: Progress | None, checkpointer, with_report: bool) -> SimplifyResult:
-        from appearance_opt.fit.loop import FitOptions, FitResult, fit
-        from appearance_opt.fit.model import Model, Rates
-        from appearance_opt.fit.validation import Validation
+        from appearance_opt.jobs.fitting import clean_maps, fit_start
         from appearance_opt.latent.export import to_asset
-        from appearance_opt.reference.pool import ReferencePool
 
         o = self.options
-        pool = ReferencePool(self.reference, self.sampler, o.pool, o.views, o.resolution, POOL_SAMPLES)
-        held_out = self.sampler.held_out(1).draw(0, VALIDATION_VIEWS)
-        validation = Validation(self.reference, held_out, min(o.resolution, 256))
-        model = Model(self.start.mesh, self.start.maps, frozenset(o.fit), Rates())
-        quality, rates = effort(validation.psnr(model), self.start.relative)
-        given = (o.position_rate, o.normal_rate, o.color_rate, o.material_rate)
-        defaults = (rates.position, rates.normal, rates.base_color, rates.material)
-        model.set_rates(Rates(*(d if g is None else g for g, d in zip(given, defaults, strict=True))))
-        self.watch.lap("set-up")
-        seconds = None
-        if o.budget is not None:
-            reserve = EXPORT_SECONDS + (REPORT_SECONDS if with_report else 0.0)
-            seconds = max(o.budget - self.watch.total - reserve, 0.0)
-        relative = self.start.relative if o.relative is None else o.relative
-        fit_options = FitOptions(
-            steps=o.steps if seconds is not None or o.steps is not None else 1000,
-            seconds=seconds,
-            loss=o.loss,
+        model, fitted, error = fit_start(
+            self.reference,
+            self.sampler,
+            self.start,
+            o,
+            self.watch,
             laplacian=o.laplacian,
-            relative=relative,
-            background=o.background_color(),
-            quality=quality,
-            seed=o.seed,
+            relative=self.start.relative if o.relative is None else o.relative,
+            progress=progress,
+            checkpointer=checkpointer,
+            with_report=with_report,
         )
-        error = None
-        try:
-            fitted = fit(model, pool, validation, fit_options, progress, checkpointer)
-        except DivergedError as diverged:  # the model holds the best state, which is written before this is told
-            error, fitted = diverged, FitResult()
-        self.watch.lap("fit")
         centre, scale = np.array(self.frame[0]), self.frame[1]
 
         def export(positions: NDArray, maps: dict) -> Asset:
@@ -206,37 +156,6 @@ class _Job:
         return SimplifyResult(
             result, begin, fitted, len(self.start.mesh.faces), self.asset.triangle_count, notes=notes, error=error
         )
-
-
-def effort(psnr: float, likeness: bool) -> tuple[Quality, Rates]:
-    """Sampling and learning rates for a start of the given held-out PSNR (dB).
-
-    A good start is easily spoilt: large steps undo it before they find something better. ``likeness``: False for a start that knows nothing (a sphere).
-    """
-    from appearance_opt.fit.model import Rates
-    from appearance_opt.render.gradient import Quality
-
-    if not likeness:
-        return Quality(1.0, 4, 1), Rates(0.05, 0.01, 0.02, 0.01)
-    rate = 0.006 * float(np.clip(10 ** ((25.0 - psnr) / 30.0), 0.25, 1.0))
-    return Quality(), Rates(rate, rate, rate, rate)
-
-
-def clean_maps(model, known: NDArray) -> dict:
-    """The model's maps and constants, texels outside of all charts filled from the inside."""
-    from appearance_opt.initial.fill import fill
-    from appearance_opt.initial.transfer import texel_coverage
-
-    maps = model.host_maps()
-    out: dict = dict(model.constants)
-    if not maps:
-        return out
-    names = list(maps)
-    inside = texel_coverage(model.topology.mesh, len(maps[names[0]]))
-    seen = model.touched(inside, known)
-    stacked = fill(np.stack([maps[n] for n in names], axis=-1), seen)
-    out.update({n: stacked[..., k] for k, n in enumerate(names)})
-    return out
 
 
 def in_frame(asset: Asset, centre: tuple[float, float, float], scale: float) -> Asset:

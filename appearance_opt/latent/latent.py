@@ -9,6 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from appearance_opt.asset.normals import weld
 from appearance_opt.latent import mesh_ops
 from appearance_opt.latent.mesh_ops import Corners
 from appearance_opt.render import upload
@@ -26,6 +27,9 @@ class LatentMesh:
     ``positions`` (V, 3); ``faces`` (F, 3) into them; ``frame_vertex`` (R,): the vertex of each render
     vertex; ``frame_faces`` (F, 3) into the render vertices; ``uvs`` (R, 2). Render vertices are split at
     UV seams and where the handedness of the mapping changes.
+
+    ``normals`` (V, 3), ``tangents`` (R, 4), given together: frames of a mesh that keeps its shape and its own
+    normals. Its vertices are then split at hard edges, too, and only texels can be fitted.
     """
 
     positions: NDArray[np.float32]
@@ -33,6 +37,8 @@ class LatentMesh:
     frame_vertex: NDArray[np.int32]
     frame_faces: NDArray[np.int32]
     uvs: NDArray[np.float32]
+    normals: NDArray[np.float32] | None = None
+    tangents: NDArray[np.float32] | None = None
 
 
 class LatentTopology:
@@ -51,11 +57,16 @@ class LatentTopology:
         )
         self.faces = upload.index_packets(mesh.faces)
         self.frame_faces = upload.index_packets(mesh.frame_faces)
-        self.edges = edge_list(mesh.faces)
+        # silhouettes run along welded edges: a seam is none
+        self.edges = edge_list(mesh.faces if mesh.normals is None else welded(mesh.positions, mesh.faces))
         self.handedness = mi.Float(handedness(mesh))
+        self._fixed = self._fixed_surface() if mesh.normals is not None else None
 
     def surface(self, positions: mi.Float) -> Surface:
-        """Surface of flat positions (3 V); differentiable in them."""
+        """Surface of flat positions (3 V); differentiable in them. A mesh with its own normals ignores
+        ``positions``: it does not move."""
+        if self._fixed is not None:
+            return self._fixed
         p = dr.gather(mi.Point3f, positions, dr.arange(mi.UInt32, len(self.mesh.positions)))
         normals = mesh_ops.vertex_normals(positions, self.corners)
         vertices = _interleave(p.x, p.y, p.z, mi.Float(0), normals.x, normals.y, normals.z, mi.Float(0))
@@ -67,6 +78,21 @@ class LatentTopology:
             frames = self.corners.uvs
         dr.eval(vertices, frames)
         return Surface(self.faces, vertices, self.frame_faces, frames, None, self.tangents)
+
+    def _fixed_surface(self) -> Surface:
+        m = self.mesh
+        assert m.normals is not None and m.tangents is not None
+        vertices = upload.packets(8, m.positions, np.zeros(len(m.positions)), m.normals)
+        frames = self.corners.uvs
+        if self.tangents:
+            frames = upload.packets(8, m.uvs, m.tangents[:, 3], np.zeros(len(m.uvs)), m.tangents[:, :3])
+        return Surface(self.faces, vertices, self.frame_faces, frames, None, self.tangents)
+
+
+def welded(positions: NDArray, faces: NDArray) -> NDArray[np.intp]:
+    """(F, 3) the same faces through one representative vertex per place."""
+    first, place = weld(positions)
+    return first[place[faces]]
 
 
 def handedness(mesh: LatentMesh) -> NDArray[np.float32]:

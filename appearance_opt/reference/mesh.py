@@ -15,7 +15,7 @@ from appearance_opt.reference.textures import material_maps
 from appearance_opt.render import deferred, upload
 from appearance_opt.render.deferred import Grid
 from appearance_opt.render.material import evaluate, shading_normal
-from appearance_opt.render.surface import Surface, interpolate_at
+from appearance_opt.render.surface import Surface, face_normal, interpolate_at
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -110,6 +110,16 @@ class MeshReference:
             hit = interpolate_at(self.surface, triangle, b1, b2, area)
             sample = evaluate(self.maps, hit)
             return SurfaceSample(sample.base_color, sample.roughness, sample.metalness, shading_normal(hit, sample))
+
+    def frame_at(self, triangle: mi.UInt32, b1: mi.Float, b2: mi.Float) -> tuple[mi.Point3f, mi.Vector3f, mi.Vector3f]:
+        """(position, normal of the triangle by its winding, interpolated vertex normal), the last turned to
+        the side of the first; unit vectors."""
+        with dr.suspend_grad():
+            hit = interpolate_at(self.surface, triangle, b1, b2, mi.Float(0))
+            geometric = face_normal(self.surface, triangle, mi.Bool(True))
+            geometric *= dr.rsqrt(dr.fmax(dr.squared_norm(geometric), 1e-30))
+            smooth = dr.select(dr.dot(hit.normal, geometric) < 0, -hit.normal, hit.normal)
+            return hit.position, geometric, smooth
 
 
 def _host(image: mi.Float, grid: Grid) -> NDArray[np.float32]:

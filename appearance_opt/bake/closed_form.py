@@ -1,0 +1,170 @@
+"""The closed-form bake: for every texel, a ray finds the point of the heavy mesh that it stands for.
+
+No image, no optimisation: seconds. Worked off in bands of rows, so that memory does not grow with the size of
+the maps, but for the maps themselves.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from appearance_opt.bake.curvature import mean_curvature
+from appearance_opt.bake.occlusion import openness
+from appearance_opt.bake.points import Points, TexelPoints, interpolate_packets
+from appearance_opt.bake.search import REACH, Found, Pick, deviation, find
+from appearance_opt.initial.fill import fill
+from appearance_opt.render import upload
+from appearance_opt.render.rays import sub_pixel_offsets
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from appearance_opt.latent.latent import LatentMesh
+    from appearance_opt.reference.mesh import MeshReference
+    from appearance_opt.render.surface import Hit
+
+FIELDS: dict[str, tuple[str, ...]] = {
+    "material": ("red", "green", "blue", "roughness", "metalness"),
+    "normal": ("normal_x", "normal_y", "normal_z"),
+    "object-normal": ("object_x", "object_y", "object_z"),
+    "displacement": ("displacement",),
+    "ao": ("occlusion",),
+    "curvature": ("curvature",),
+}
+"""What can be baked, and the channels of each."""
+
+FAR = 4.0
+"""Nothing lies farther than this in a frame in which the object has radius 1."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What to bake and how. ``fields``: names of ``FIELDS``. ``samples``: rays per texel. ``reach``: how far
+    rays go outward and inward, None for the automatic cage. Lengths in units of the frame."""
+
+    size: int
+    fields: tuple[str, ...] = ("material", "normal")
+    samples: int = 1
+    reach: float | None = None
+    pick: Pick = "nearest"
+    ao_rays: int = 64
+    ao_distance: float = float("inf")
+
+
+@dataclass(frozen=True)
+class BakedMaps:
+    """``maps``: channel name -> (size, size) float32, natural units (linear colours, normals in [-1, 1],
+    lengths in units of the frame), filled everywhere. ``covered``: texels that belong to a triangle of the
+    atlas. ``missed``: those among them whose rays found nothing. ``reach``: how far rays went."""
+
+    maps: dict[str, NDArray[np.float32]]
+    covered: NDArray[np.bool_]
+    missed: NDArray[np.bool_]
+    reach: float
+
+    @property
+    def missed_share(self) -> float:
+        """Fraction of the covered texels whose rays found nothing."""
+        return float(self.missed.sum() / max(self.covered.sum(), 1))
+
+
+def bake(reference: MeshReference, mesh: LatentMesh, settings: Settings) -> BakedMaps:
+    """The maps of ``mesh``, whose atlas must lie in the unit square, from the reference."""
+    size = settings.size
+    names = [c for f in settings.fields for c in FIELDS[f]]
+    values = np.empty((size, size, len(names)), np.float32)
+    found, covered = np.empty((size, size), bool), np.empty((size, size), bool)
+    with dr.suspend_grad():
+        reach = REACH * deviation(reference, mesh) if settings.reach is None else settings.reach
+        run = _Run(reference, TexelPoints(mesh, size, settings.samples), settings, reach)
+        for row in range(0, size, run.points.rows):
+            sums = run.band(row)[: size - row]
+            here = slice(row, row + len(sums))
+            hits = sums[..., len(names)]
+            values[here] = sums[..., : len(names)] / np.maximum(hits, 1)[..., None]
+            found[here], covered[here] = hits > 0, sums[..., len(names) + 1] > 0
+    maps: dict[str, NDArray[np.float32]] = {}
+    start = 0
+    for field in settings.fields:
+        channels = FIELDS[field]
+        own = values[..., start : start + len(channels)]
+        start += len(channels)
+        if field in ("normal", "object-normal"):
+            own = own / np.maximum(np.linalg.norm(own, axis=-1, keepdims=True), 1e-6)
+        filled = fill(own, found)
+        maps.update({c: np.ascontiguousarray(filled[..., k]) for k, c in enumerate(channels)})
+    return BakedMaps(maps, covered, covered & ~found, reach)
+
+
+class _Run:
+    """What every band needs."""
+
+    def __init__(self, reference: MeshReference, points: TexelPoints, settings: Settings, reach: float) -> None:
+        self.reference, self.points, self.settings = reference, points, settings
+        self.reach = dr.opaque(mi.Float, reach)
+        self.width = 1 << (sum(len(FIELDS[f]) for f in settings.fields) + 1).bit_length()
+        self.curvature: mi.Float | None = None
+        if "curvature" in settings.fields:
+            merged = reference.merged
+            self.curvature = upload.packets(1, mean_curvature(merged.positions, merged.faces))
+
+    def band(self, row: int) -> NDArray[np.float32]:
+        """(rows, size, width) sums over the samples of each texel: channels, hits, samples inside a chart."""
+        rows, size = self.points.rows, self.points.size
+        total = dr.zeros(mi.Float, rows * size * self.width)
+        for k, (dx, dy) in enumerate(sub_pixel_offsets(self.settings.samples)):
+            points = self.points.band(row, float(dx), float(dy))
+            if points is not None:
+                self._add(total, points, (row * size) * self.settings.samples + k)
+        return np.array(total).reshape(rows, size, self.width)
+
+    def _add(self, total: mi.Float, points: Points, seed: int) -> None:
+        found = find(self.reference, points, self.reach, self.settings.pick)
+        dr.eval(found, points)
+        rows = [dr.select(found.valid, x, 0) for x in self._values(points, found, seed)]
+        rows += [dr.select(found.valid, mi.Float(1), 0), mi.Float(1)]
+        rows += [mi.Float(0)] * (self.width - len(rows))
+        # one sample of each texel: no two threads meet
+        dr.scatter_reduce(dr.ReduceOp.Add, total, mi.ArrayXf(rows), points.texel, mode=dr.ReduceMode.NoConflicts)
+        dr.eval(total)
+
+    def _values(self, points: Points, found: Found, seed: int) -> list[mi.Float]:
+        """All channels of the wanted fields, in order."""
+        fields = self.settings.fields
+        prim = dr.select(found.valid, found.triangle, 0)
+        out: dict[str, list[mi.Float]] = {}
+        if {"material", "normal", "object-normal"} & set(fields):
+            s = self.reference.sample(prim, found.b1, found.b2, points.area)
+            color = s.base_color
+            normal = dr.select(dr.dot(s.normal, points.here.normal) < 0, -s.normal, s.normal)
+            out["material"] = [color.x, color.y, color.z, s.roughness, s.metalness]
+            out["normal"] = in_frame_of(points.here, normal)
+            out["object-normal"] = [normal.x, normal.y, normal.z]
+        out["displacement"] = [found.distance]
+        if "ao" in fields:
+            o = self.settings
+            number = points.texel + dr.opaque(mi.UInt32, seed % 2**32)
+            out["ao"] = [openness(self.reference, found, number, o.ao_rays, o.ao_distance, FAR)]
+        if self.curvature is not None:
+            surface = self.reference.surface
+            out["curvature"] = interpolate_packets(surface, self.curvature, prim, found.b1, found.b2, 1)
+        return [x for f in fields for x in out[f]]
+
+
+def in_frame_of(here: Hit, normal: mi.Vector3f) -> list[mi.Float]:
+    """A world-space normal in the shader's frame, whose tangent need not be perpendicular to the
+    interpolated normal. It never points below the surface."""
+    n, t = here.normal, here.tangent
+    assert t is not None and here.handedness is not None
+    bitangent = dr.cross(n, t) * here.handedness
+    c = dr.dot(n, t)
+    scale = dr.rcp(dr.fmax(1 - c * c, 1e-3))
+    x = (dr.dot(normal, t) - c * dr.dot(normal, n)) * scale
+    y = dr.dot(normal, bitangent) * scale
+    z = (dr.dot(normal, n) - c * dr.dot(normal, t)) * scale
+    return [x, y, dr.fmax(z, 0.05)]

@@ -1,0 +1,56 @@
+"""Ambient occlusion at points of the heavy mesh."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import drjit as dr
+import mitsuba as mi
+
+from appearance_opt.render.rays import sub_pixel_offsets
+
+if TYPE_CHECKING:
+    from appearance_opt.bake.search import Found
+    from appearance_opt.reference.mesh import MeshReference
+
+LIFT = 1e-4
+"""How far rays start above the surface, in units of the object's radius (1 in the frame of a bake)."""
+
+
+def openness(
+    reference: MeshReference, found: Found, seed: mi.UInt32, rays: int, distance: float, far: float
+) -> mi.Float:
+    """Cosine-weighted share of the hemisphere in which nothing is met within ``distance``, in [0, 1].
+
+    ``rays`` directions per point, a low-discrepancy sequence shifted by a hash of ``seed`` (Cranley and
+    Patterson 1976). ``far``: a distance beyond which there is nothing.
+    """
+    prim = dr.select(found.valid, found.triangle, 0)
+    position, geometric, normal = reference.frame_at(prim, found.b1, found.b2)
+    tangent = dr.normalize(dr.cross(normal, dr.select(dr.abs(normal.x) < 0.9, mi.Vector3f(1, 0, 0), [0, 1, 0])))
+    bitangent = dr.cross(normal, tangent)
+    origin = dr.fma(geometric, LIFT, position)
+    length = dr.opaque(mi.Float, min(distance, far))
+    shift_u, shift_v = mi.Float(_hash(seed)) * 2**-32, mi.Float(_hash(seed ^ 0x68BC21EB)) * 2**-32
+    free = dr.zeros(mi.Float, dr.width(position))
+    dr.eval(origin, geometric, normal, tangent, bitangent, shift_u, shift_v)
+    for x, y in sub_pixel_offsets(rays):
+        u, v = shift_u + dr.opaque(mi.Float, x), shift_v + dr.opaque(mi.Float, y)
+        radius, angle = dr.sqrt(u - dr.floor(u)), v * (2 * dr.pi)
+        s, c = dr.sincos(angle)
+        height = dr.sqrt(dr.fmax(1 - dr.square(radius), 0))
+        d = tangent * (radius * c) + bitangent * (radius * s) + normal * height
+        # the interpolated normal's hemisphere dips below coarse faces: turn such rays up again
+        below = dr.dot(d, geometric)
+        d = dr.select(below < 0, d - geometric * (2 * below), d)
+        hit = reference.scene.ray_test(mi.Ray3f(origin, d, length, 0, mi.Color0f()), active=found.valid)
+        free += dr.select(hit, mi.Float(0), mi.Float(1))
+        dr.eval(free)
+    return free * dr.opaque(mi.Float, 1 / rays)
+
+
+def _hash(x: mi.UInt32) -> mi.UInt32:
+    """Integer hash (Wellons 2018, lowbias32)."""
+    x = (x ^ (x >> 16)) * 0x7FEB352D
+    x = (x ^ (x >> 15)) * 0x846CA68B
+    return x ^ (x >> 16)

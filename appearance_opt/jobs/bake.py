@@ -1,0 +1,239 @@
+"""Bake: a heavy asset's look in the maps of a light one, which keeps its shape and its texture coordinates."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from appearance_opt import backend
+from appearance_opt.asset import load, save
+from appearance_opt.asset.paths import replacing
+from appearance_opt.errors import DivergedError, InputError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from appearance_opt.asset.types import Asset
+    from appearance_opt.bake.closed_form import BakedMaps
+    from appearance_opt.bake.low import Low
+    from appearance_opt.config import BakeOptions
+    from appearance_opt.fit.loop import FitResult, Progress
+    from appearance_opt.jobs.fitting import Stopwatch
+
+log = logging.getLogger(__name__)
+
+MISSED_NOTE, MISSED_ERROR = 0.01, 0.5
+"""Shares of missed texels from which on the user is told, and the bake is refused."""
+
+
+@dataclass
+class BakeResult:
+    """What ``bake`` did. ``asset``: LOW with the maps; ``closed_form``: the same before the fit; ``fit``: None
+    without one; ``maps``: channel name -> (size, size), lengths in metres; ``covered``, ``missed``: texels of
+    charts, and those whose rays found nothing; ``reach``: how far rays went, metres; ``seconds`` by stage."""
+
+    asset: Asset
+    closed_form: Asset
+    fit: FitResult | None
+    maps: dict[str, NDArray[np.float32]]
+    covered: NDArray[np.bool_]
+    missed: NDArray[np.bool_]
+    reach: float
+    seconds: dict[str, float] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+
+    @property
+    def missed_share(self) -> float:
+        """Fraction of the covered texels whose rays found nothing."""
+        return float(self.missed.sum() / max(self.covered.sum(), 1))
+
+
+def bake(
+    high: str | Path | Asset,
+    low: str | Path | Asset,
+    out: str | Path | None,
+    options: BakeOptions,
+    *,
+    report: str | Path | None = None,
+    textures: str | Path | None = None,
+    progress: Progress | None = None,
+) -> BakeResult:
+    """Bake ``high`` to ``low`` (paths or assets) and write LOW with its new maps to ``out`` (None: do not write).
+
+    ``report``: folder for pictures, metrics and report.html. ``textures``: folder for the maps as loose files;
+    maps for which the format of ``out`` has no place are always written, by default to ``<out's stem>_maps``.
+    Raises AppearanceError.
+    """
+    from appearance_opt.jobs.fitting import Stopwatch
+    from appearance_opt.jobs.simplify import check_paths
+
+    watch = Stopwatch()
+    if out is not None:
+        for source in (high, low):
+            check_paths(Path(source) if isinstance(source, (str, Path)) else None, Path(out))
+    heavy = load(high, refine=options.refine) if isinstance(high, (str, Path)) else high
+    light = load(low, refine=options.refine) if isinstance(low, (str, Path)) else low
+    watch.lap("load")
+    run = _Job(heavy, light, str(low) if isinstance(low, (str, Path)) else light.name, options, watch)
+    result, error = run.run(progress, report is not None)
+    if out is not None:
+        save(result.asset, out)
+        _write_loose(result, options, Path(out), textures)
+        watch.lap("write")
+    if error is not None:
+        raise error
+    if report is not None:
+        from appearance_opt.jobs.report import write_bake_report
+
+        result.seconds = dict(watch.stages)
+        write_bake_report(Path(report), run.high, result, run.sampler, run.frame, options)
+        watch.lap("report")
+    result.seconds = {**watch.stages, "total": watch.total}
+    return result
+
+
+class _Job:
+    """Both assets in one frame; then the closed form, then the fit."""
+
+    def __init__(self, high: Asset, low: Asset, name: str, options: BakeOptions, watch: Stopwatch) -> None:
+        from appearance_opt.bake import check
+        from appearance_opt.bake.low import moved, prepare, unwrapped
+        from appearance_opt.jobs.simplify import in_frame, support
+        from appearance_opt.reference.mesh import MeshReference
+        from appearance_opt.views import ViewSampler, framing
+
+        self.options, self.watch = options, watch
+        self.notes = [*high.notes, *(f"LOW: {n}" for n in low.notes)]
+        self.high = self._aligned(high, low) if options.align else high
+        check.check_place(self.high, low)
+        if options.unwrap:
+            low = unwrapped(low, options.texture_size)
+        check.check_uvs(low, name)
+        backend.select(options.device)
+        self.low: Low = prepare(low)
+        if not options.unwrap:
+            check.check_overlap(self.low.mesh, name)
+        watch.lap("check")
+        self.frame = framing(np.concatenate([m.positions for a in (self.high, low) for m in a.meshes]))
+        self.reference = MeshReference(in_frame(self.high, *self.frame))
+        self.mesh = moved(self.low.mesh, np.array(self.frame[0]), self.frame[1])
+        hull = support(self.reference.merged.positions)
+        self.sampler = ViewSampler((0.0, 0.0, 0.0), 1.0, options.seed, hull=hull, light=options.light)
+        watch.lap("reference")
+
+    def _aligned(self, high: Asset, low: Asset) -> Asset:
+        from appearance_opt.bake.align import align
+
+        placed, scale, shift = align(high, low)
+        self.notes.append(f"HIGH was scaled by {scale:.6g} and moved by {', '.join(f'{x:.6g}' for x in shift)} m")
+        return placed
+
+    def run(self, progress: Progress | None, with_report: bool) -> tuple[BakeResult, DivergedError | None]:
+        """The closed form, and the fit that starts from it."""
+        from appearance_opt.bake.closed_form import bake as bake_closed_form
+        from appearance_opt.jobs.fitting import clean_maps, fit_start
+        from appearance_opt.jobs.start import Start
+
+        baked = bake_closed_form(self.reference, self.mesh, self._settings())
+        self._check_missed(baked)
+        self.watch.lap("closed form")
+        closed = self._result(baked.maps)
+        result = BakeResult(
+            closed,
+            closed,
+            None,
+            self._in_metres(baked.maps),
+            baked.covered,
+            baked.missed,
+            baked.reach * self.frame[1],
+            notes=self.notes,
+        )
+        parts = self._fitted_parts()
+        if not parts:
+            return result, None
+        start = Start(self.mesh, {n: baked.maps[n] for n in _FITTED}, True, baked.covered)
+        options = replace(self.options, fit=parts)
+        model, fitted, error = fit_start(
+            self.reference, self.sampler, start, options, self.watch, progress=progress, with_report=with_report
+        )
+        maps = {**baked.maps, **clean_maps(model, start.known)}
+        result.fit, result.asset, result.maps = fitted, self._result(maps), self._in_metres(maps)
+        if fitted.skipped:
+            self.notes.append(f"{fitted.skipped} steps with non-finite gradients were skipped")
+        if fitted.interrupted:
+            self.notes.append(f"interrupted after {fitted.steps} steps: this is the best state so far")
+        self.watch.lap("export")
+        return result, error
+
+    def _settings(self):
+        from appearance_opt.bake.closed_form import FIELDS, Settings
+
+        o, scale = self.options, self.frame[1]
+        wanted = {n for n in FIELDS if o.wants(n)}
+        if o.wants("base-color") or o.wants("orm"):
+            wanted.add("material")
+        if self._fitted_parts():
+            wanted |= {"material", "normal"}
+        return Settings(
+            o.texture_size,
+            tuple(n for n in FIELDS if n in wanted),
+            o.samples,
+            None if o.cage is None else o.cage / scale,
+            o.hit,  # type: ignore[arg-type]
+            o.ao_rays,
+            float("inf") if o.ao_distance is None else o.ao_distance / scale,
+        )
+
+    def _fitted_parts(self) -> tuple[str, ...]:
+        """What the fit moves: parts that are written. Colour and roughness are fitted together or not at all."""
+        o = self.options
+        both = o.wants("base-color") and o.wants("orm")
+        written = {"normal": o.wants("normal"), "material": both}
+        return () if o.closed_form else tuple(p for p in o.fit if written[p])
+
+    def _check_missed(self, baked: BakedMaps) -> None:
+        reach = f"{baked.reach * self.frame[1]:.4g} m"
+        share = baked.missed_share
+        if share > MISSED_ERROR:
+            raise InputError(
+                f"{100 * share:.0f} % of the rays found nothing of HIGH within {reach}: "
+                "give a larger --cage, or --align if the two lie apart"
+            )
+        if share > MISSED_NOTE:
+            self.notes.append(f"{100 * share:.1f} % of the texels found nothing within {reach} and were filled")
+
+    def _in_metres(self, maps: dict[str, NDArray]) -> dict[str, NDArray[np.float32]]:
+        scale = self.frame[1]
+        factors = {"displacement": scale, "curvature": 1 / scale}
+        return {n: v * np.float32(factors[n]) if n in factors else v for n, v in maps.items()}
+
+    def _result(self, maps: dict[str, NDArray]) -> Asset:
+        from appearance_opt.bake.encode import material_change
+        from appearance_opt.bake.low import with_material
+
+        asset = with_material(self.low.asset, material_change(self._in_metres(maps), self.options))
+        if self.options.wants("base-color"):  # the map holds the whole colour: vertex colours would tint it again
+            asset = replace(asset, meshes=tuple(replace(m, colors=None) for m in asset.meshes))
+        return replace(asset, notes=())
+
+
+_FITTED = ("red", "green", "blue", "roughness", "metalness", "normal_x", "normal_y", "normal_z")
+
+
+def _write_loose(result: BakeResult, options: BakeOptions, out: Path, folder: str | Path | None) -> None:
+    """Loose files, if asked for or if the format of ``out`` has no place for one of the maps."""
+    from appearance_opt.bake.encode import loose_files
+
+    placeless = options.wants("object-normal") or options.wants("curvature") or options.green == "directx"
+    placeless |= options.wants("ao") and not options.wants("orm")
+    placeless |= options.wants("displacement") and out.suffix.lower() == ".obj"
+    if folder is None and not placeless:
+        return
+    target = out.with_name(out.stem + "_maps") if folder is None else Path(folder)
+    for name, data in loose_files(result.maps, result.covered, result.missed, options, out.stem).items():
+        with replacing(target / name) as temporary:
+            temporary.write_bytes(data)

@@ -1,0 +1,134 @@
+"""From a start and a reference to a fitted model: what all jobs that fit have in common."""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from appearance_opt.bake.points import texel_coverage
+from appearance_opt.errors import DivergedError
+from appearance_opt.fit.loop import FitOptions, FitResult, fit
+from appearance_opt.fit.model import Model, Rates
+from appearance_opt.fit.validation import Validation
+from appearance_opt.initial.fill import fill
+from appearance_opt.reference.pool import ReferencePool
+from appearance_opt.render.gradient import Quality
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from appearance_opt.config import CommonOptions
+    from appearance_opt.fit.checkpoint import Checkpointer
+    from appearance_opt.fit.loop import Progress
+    from appearance_opt.jobs.start import Start
+    from appearance_opt.reference.base import Reference
+    from appearance_opt.views import ViewSampler
+
+VALIDATION_VIEWS = 8
+
+POOL_SAMPLES = 32
+"""Rays per pixel of the reference's images where outlines pass: the coverage of the latent's pixels is exact, so
+that of the reference's should be, too."""
+
+EXPORT_SECONDS = 1.0
+"""Time kept back from the budget for writing the result; the report has a reserve of its own."""
+
+REPORT_SECONDS = 5.0
+
+
+class Stopwatch:
+    """Seconds by stage."""
+
+    def __init__(self) -> None:
+        self.began = self._last = time.perf_counter()
+        self.stages: dict[str, float] = {}
+
+    def lap(self, stage: str) -> None:
+        """Everything since the last lap was ``stage``."""
+        now = time.perf_counter()
+        self.stages[stage] = self.stages.get(stage, 0.0) + now - self._last
+        self._last = now
+
+    @property
+    def total(self) -> float:
+        """Seconds since the start."""
+        return time.perf_counter() - self.began
+
+
+def fit_start(
+    reference: Reference,
+    sampler: ViewSampler,
+    start: Start,
+    options: CommonOptions,
+    watch: Stopwatch,
+    *,
+    laplacian: float = 0.0,
+    relative: bool = True,
+    progress: Progress | None = None,
+    checkpointer: Checkpointer | None = None,
+    with_report: bool = False,
+) -> tuple[Model, FitResult, DivergedError | None]:
+    """Fit what ``options.fit`` names, from ``start``, within what is left of the budget on ``watch``.
+
+    The model is left at its best state by held-out PSNR; so it is when the fit diverged, which is returned
+    rather than raised: the state is worth writing first.
+    """
+    o = options
+    pool = ReferencePool(reference, sampler, o.pool, o.views, o.resolution, POOL_SAMPLES)
+    held_out = sampler.held_out(1).draw(0, VALIDATION_VIEWS)
+    validation = Validation(reference, held_out, min(o.resolution, 256))
+    model = Model(start.mesh, start.maps, frozenset(o.fit), Rates())
+    quality, rates = effort(validation.psnr(model), start.relative)
+    given = (o.position_rate, o.normal_rate, o.color_rate, o.material_rate)
+    defaults = (rates.position, rates.normal, rates.base_color, rates.material)
+    model.set_rates(Rates(*(d if g is None else g for g, d in zip(given, defaults, strict=True))))
+    watch.lap("set-up")
+    seconds = None
+    if o.budget is not None:
+        reserve = EXPORT_SECONDS + (REPORT_SECONDS if with_report else 0.0)
+        seconds = max(o.budget - watch.total - reserve, 0.0)
+    fit_options = FitOptions(
+        steps=o.steps if seconds is not None or o.steps is not None else 1000,
+        seconds=seconds,
+        loss=o.loss,
+        laplacian=laplacian,
+        relative=relative,
+        background=o.background_color(),
+        quality=quality,
+        seed=o.seed,
+    )
+    error = None
+    try:
+        fitted = fit(model, pool, validation, fit_options, progress, checkpointer)
+    except DivergedError as diverged:
+        error, fitted = diverged, FitResult()
+    watch.lap("fit")
+    return model, fitted, error
+
+
+def effort(psnr: float, likeness: bool) -> tuple[Quality, Rates]:
+    """Sampling and learning rates for a start of the given held-out PSNR (dB).
+
+    A good start is easily spoilt: large steps undo it before they find something better. ``likeness``: False for
+    a start that knows nothing (a sphere).
+    """
+    if not likeness:
+        return Quality(1.0, 4, 1), Rates(0.05, 0.01, 0.02, 0.01)
+    rate = 0.006 * float(np.clip(10 ** ((25.0 - psnr) / 30.0), 0.25, 1.0))
+    return Quality(), Rates(rate, rate, rate, rate)
+
+
+def clean_maps(model: Model, known: NDArray) -> dict:
+    """The model's maps and constants, texels outside of all charts filled from the inside."""
+    maps = model.host_maps()
+    out: dict = dict(model.constants)
+    if not maps:
+        return out
+    names = list(maps)
+    inside = texel_coverage(model.topology.mesh, len(maps[names[0]]))
+    seen = model.touched(inside, known)
+    stacked = fill(np.stack([maps[n] for n in names], axis=-1), seen)
+    out.update({n: stacked[..., k] for k, n in enumerate(names)})
+    return out
