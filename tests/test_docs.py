@@ -36,3 +36,11 @@ def test_every_option_is_documented() -> None:
     text = (ROOT / "docs" / "usage.md").read_text(encoding="utf-8")
     missing = [n for n in OPTION_NAMES if f"--{n.replace('_', '-')}" not in text and not n.endswith("_rate")]
     assert not missing
+
+
+def test_every_option_of_a_bake_is_documented() -> None:
+    from appearance_opt.config import BAKE_OPTION_NAMES, MAPS
+
+    text = (ROOT / "docs" / "baking.md").read_text(encoding="utf-8")
+    assert not [n for n in BAKE_OPTION_NAMES if f"`--{n.replace('_', '-')}" not in text]
+    assert not [n for n in MAPS if f"`{n}`" not in text]

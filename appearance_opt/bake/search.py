@@ -25,6 +25,9 @@ REACH = 4.0
 
 QUANTILE = 0.999
 
+BACK = 1e-3
+"""How far before the surface rays start, in units of their reach."""
+
 Pick = Literal["nearest", "outermost"]
 
 
@@ -52,10 +55,13 @@ def find(reference: MeshReference, points: Points, reach: mi.Float, pick: Pick =
         start = dr.fma(along, reach, position)
         triangle, b1, b2, t = _facing_hit(reference, start, -along, along, 2 * reach)
         return Found(triangle, b1, b2, reach - t, t < 2 * reach)
-    ahead = _facing_hit(reference, position, along, along, reach)
-    behind = _facing_hit(reference, position, -along, along, reach)
+    # a ray from a surface does not meet that surface: start a little before it, for where the two meshes coincide
+    back = BACK * reach
+    ahead = _facing_hit(reference, dr.fma(-along, back, position), along, along, reach + back)
+    behind = _facing_hit(reference, dr.fma(along, back, position), -along, along, reach + back)
     take = ahead[3] < behind[3]
     triangle, b1, b2, t = (dr.select(take, a, b) for a, b in zip(ahead, behind, strict=True))
+    t -= back
     return Found(triangle, b1, b2, dr.select(take, t, -t), t < reach)
 
 

@@ -1,0 +1,209 @@
+"""Closed-form bake against Blender's Cycles bake, and the fitted bake against the closed form.
+
+    python -m experiments.baking --blender BPY/bin/python [--rows chess_king,...] [--preset default] [--table]
+
+BPY is a virtual environment of its own, for Blender's package wants other versions than ours:
+
+    python3.11 -m venv BPY && BPY/bin/pip install "bpy==4.5.*"
+
+Without --blender, its table stays empty. Pairs: each asset decimated to 2 to 5 % of its triangles and unwrapped,
+geometry alone; both bakers get the same two files. The judge is the renderer in ``../shared/judge``, which is not
+ours. Each stage that is on disk in ``out/baking`` is not run again (delete the folder to start over); ``--table``
+prints the tables for docs/baking.md from what is there. Times are of the bakes alone, ours with warm kernels.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+ROOT = Path(__file__).resolve().parents[2]
+JUDGE = ROOT.parent / "shared" / "judge"
+OUT = ROOT / "out" / "baking"
+ROWS = {"chess_king": 4864, "flight_helmet": 2820, "relic": 8182}
+SIZE = 1024
+METRICS = (("psnr_cov", 2), ("flip", 4), ("sil_shift_px", 3))
+
+
+def source_of(asset: str) -> Path:
+    """The heavy asset; the procedural scene is built when it is first asked for."""
+    if asset != "relic":
+        return JUDGE / "references" / f"{asset}.glb"
+    path = OUT / "relic.glb"
+    if not path.exists():
+        subprocess.run([sys.executable, "-m", "scenes.build", "relic", str(path)], check=True, cwd=ROOT)
+    return path
+
+
+def make_low(source: Path, triangles: int, path: Path) -> None:
+    """Decimated and unwrapped, no material."""
+    from appearance_opt import backend, save
+    from appearance_opt.asset import load
+    from appearance_opt.asset.types import Asset, Mesh
+    from appearance_opt.config import simplify_options
+    from appearance_opt.jobs.simplify import simplify
+
+    backend.select("cpu")
+    options = simplify_options("draft", triangles=triangles, steps=0, pool=4, texture_size=SIZE)
+    low = simplify(load(source), None, options).start.meshes[0]
+    bare = Mesh(low.positions, low.faces, low.normals, low.uvs, low.tangents, name="low")
+    save(Asset((bare,), "low"), path)
+
+
+def ours(source: Path, low: Path, stem: Path, preset: str) -> dict:
+    """Closed form and fit. Returns times and what was found."""
+    from appearance_opt import bake, bake_options, save
+
+    closed = bake(source, low, f"{stem}_closed.glb", bake_options(closed_form=True, texture_size=SIZE))
+    again = bake(source, low, None, bake_options(closed_form=True, texture_size=SIZE))
+    begin = time.perf_counter()
+    fitted = bake(source, low, f"{stem}_fitted.glb", bake_options(preset, texture_size=SIZE))
+    save(fitted.closed_form, f"{stem}_start.glb")
+    assert fitted.fit is not None
+    return {
+        "missed": closed.missed_share,
+        "reach": closed.reach,
+        "seconds": closed.seconds,
+        "seconds_warm": again.seconds,
+        "fit_seconds": time.perf_counter() - begin,
+        "fit_steps": fitted.fit.steps,
+    }
+
+
+def blender(python: str, source: Path, low: Path, stem: Path, reach: float) -> dict:
+    """Blender's maps on the same mesh, as a GLB with the same frames, and how far its normals are from ours."""
+    from appearance_opt import load, save
+    from appearance_opt.asset.types import Asset, Material, Texture
+
+    folder = Path(f"{stem}_blender")
+    script = Path(__file__).with_name("blender_bake.py")
+    command = [python, str(script), str(source), str(low), str(folder), str(SIZE), str(reach), "4"]
+    subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+    maps = {n: np.load(folder / f"{n}.npy") for n in ("normal", "base_color", "roughness", "metalness")}
+    byte = {n: np.round(m / 257).astype(np.uint8) for n, m in maps.items()}
+    orm = np.stack([np.full((SIZE, SIZE), 255, np.uint8), byte["roughness"][..., 0], byte["metalness"][..., 0]], -1)
+    clamp = ("clamp", "clamp")
+    material = Material(
+        roughness=1.0,
+        metalness=1.0,
+        base_color_texture=Texture(byte["base_color"], "srgb", clamp),
+        orm_texture=Texture(orm, "linear", clamp),
+        normal_texture=Texture(byte["normal"], "linear", clamp),
+    )
+    mesh = load(f"{stem}_closed.glb").meshes[0]
+    save(Asset((replace(mesh, material=material),), "blender"), f"{stem}_blender.glb")
+    seconds = json.loads((folder / "seconds.json").read_text())
+    return {"seconds": sum(seconds.values()), "seconds_by_map": seconds, **angles(stem, maps["normal"])}
+
+
+def angles(stem: Path, theirs: np.ndarray) -> dict:
+    """Degrees between two normal maps over covered texels."""
+    from appearance_opt import load
+    from appearance_opt.bake.low import prepare
+    from appearance_opt.initial.transfer import texel_coverage
+
+    asset = load(f"{stem}_closed.glb")
+    covered = texel_coverage(prepare(asset).mesh, SIZE)
+    texture = asset.meshes[0].material.normal_texture
+    assert texture is not None
+    vectors = [v[..., :3][covered] * 2.0 - 1 for v in (texture.linear(), theirs / 65535)]
+    a, b = (v / np.maximum(np.linalg.norm(v, axis=1, keepdims=True), 1e-9) for v in vectors)
+    angle = np.degrees(np.arccos(np.clip(np.sum(a * b, axis=1), -1, 1)))
+    quantiles = {f"angle_{q}": float(np.percentile(angle, q)) for q in (50, 90, 99)}
+    return {"angle_mean": float(angle.mean()), **quantiles}
+
+
+def judge(source: Path, candidates: dict[str, str], stem: Path, views: int) -> dict:
+    """Scores by candidate."""
+    scores = Path(f"{stem}.judge.json")
+    options = ["--views", str(views), "--spp", "36", "--json", str(scores)]
+    command = [sys.executable, str(JUDGE / "evaluate.py"), str(source), *candidates.values(), *options]
+    subprocess.run(command, check=True, capture_output=True, cwd=JUDGE)
+    return dict(zip(candidates, json.loads(scores.read_text())["candidates"], strict=True))
+
+
+def run_row(asset: str, preset: str, python: str | None, views: int) -> dict:
+    """One asset, all stages."""
+    OUT.mkdir(parents=True, exist_ok=True)
+    stem = OUT / asset
+    path = Path(f"{stem}.json")
+    row = json.loads(path.read_text()) if path.exists() else {"asset": asset, "triangles": ROWS[asset]}
+    source, low = source_of(asset), Path(f"{stem}_low.glb")
+    if not low.exists():
+        make_low(source, ROWS[asset], low)
+    if row.get("preset") != preset:
+        row.update(ours=ours(source, low, stem, preset), preset=preset)
+        row.pop("scores", None)
+        path.write_text(json.dumps(row, indent=1))
+    if python is not None and "blender" not in row:
+        row["blender"] = blender(python, source, low, stem, row["ours"]["reach"])
+        row.pop("scores", None)
+        path.write_text(json.dumps(row, indent=1))
+    if "scores" not in row:
+        names = ["closed", "fitted"] + (["blender"] if "blender" in row else [])
+        row["scores"] = judge(source, {n: f"{stem}_{n}.glb" for n in names}, stem, views)
+        path.write_text(json.dumps(row, indent=1))
+    return row
+
+
+def cell(scores: dict) -> str:
+    return " / ".join(f"{scores[m]:.{d}f}" for m, d in METRICS)
+
+
+def tables(rows: list[dict]) -> str:
+    """Markdown."""
+    lines = [
+        "| asset, triangles | Blender | closed form | normals apart (degrees): mean, median, 99 % | time ratio |",
+        "|---|---|---|---|---|",
+    ]
+    for r in rows:
+        name = f"{r['asset']}, {r['triangles']}"
+        if "blender" not in r:
+            continue
+        b = r["blender"]
+        degrees = ", ".join(f"{b[k]:.2f}" for k in ("angle_mean", "angle_50", "angle_99"))
+        ratio = b["seconds"] / r["ours"]["seconds_warm"]["closed form"]
+        lines.append(
+            f"| {name} | {cell(r['scores']['blender'])} | {cell(r['scores']['closed'])} | {degrees} | {ratio:.1f} |"
+        )
+    lines += [
+        "",
+        "| asset, triangles | closed form | fitted | gain (dB) | FLIP ratio | steps |",
+        "|---|---|---|---|---|---|",
+    ]
+    for r in rows:
+        c, f = r["scores"]["closed"], r["scores"]["fitted"]
+        lines.append(
+            f"| {r['asset']}, {r['triangles']} | {cell(c)} | {cell(f)} | {f['psnr_cov'] - c['psnr_cov']:+.2f} | "
+            f"{f['flip'] / c['flip']:.2f} | {r['ours']['fit_steps']} |"
+        )
+    return "\n".join(lines)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--blender", default=None, metavar="PYTHON")
+    parser.add_argument("--rows", default=",".join(ROWS))
+    parser.add_argument("--preset", default="default")
+    parser.add_argument("--views", type=int, default=24)
+    parser.add_argument("--table", action="store_true")
+    a = parser.parse_args()
+    names = [n for n in a.rows.split(",") if n]
+    if a.table:
+        found = [OUT / f"{n}.json" for n in names]
+        print(tables([r for p in found if p.exists() for r in [json.loads(p.read_text())] if "scores" in r]))
+        return
+    if not JUDGE.exists():
+        sys.exit(f"{JUDGE} is not there: this experiment needs the neutral renderer and its references")
+    print(tables([run_row(n, a.preset, a.blender, a.views) for n in names]))
+
+
+if __name__ == "__main__":
+    main()
