@@ -13,14 +13,14 @@ import pytest
 from appearance_opt.asset import load, save
 from appearance_opt.asset.images import read
 from appearance_opt.asset.types import Asset, Material, Mesh, Texture
-from appearance_opt.bake import points as bake_points
-from appearance_opt.bake.align import align
-from appearance_opt.bake.check import overlap
-from appearance_opt.bake.closed_form import BakedMaps, Settings
-from appearance_opt.bake.closed_form import bake as closed_form
-from appearance_opt.bake.curvature import mean_curvature
-from appearance_opt.bake.low import prepare, unwrapped
-from appearance_opt.bake.points import TexelPoints
+from appearance_opt.baking import points as bake_points
+from appearance_opt.baking.align import align
+from appearance_opt.baking.check import overlap
+from appearance_opt.baking.closed_form import BakedMaps, Settings
+from appearance_opt.baking.closed_form import bake as closed_form
+from appearance_opt.baking.curvature import mean_curvature
+from appearance_opt.baking.low import prepare, unwrapped
+from appearance_opt.baking.points import TexelPoints
 from appearance_opt.config import bake_options, read_toml
 from appearance_opt.errors import InputError
 from appearance_opt.evaluate.metrics import compare_images
@@ -237,12 +237,12 @@ def test_a_latent_with_its_own_normals_is_drawn_as_the_asset() -> None:
 
 
 def test_the_fit_improves_on_the_closed_form_and_keeps_the_shape(ball: Asset, tmp_path: Path) -> None:
-    low = asset_of(sphere(150, (0.0, 0.0, 0.0), 1.0, SIZE))
-    options = bake_options(texture_size=SIZE, resolution=64, pool=16, steps=40)
+    low = asset_of(sphere(600, (0.0, 0.0, 0.0), 1.0, 32))
+    options = bake_options(texture_size=32, resolution=48, pool=8, steps=30)
     result = bake(ball, low, tmp_path / "out.usda", options, report=tmp_path / "report")
     assert result.fit is not None
-    # measured +0.9 dB
-    assert max(p.psnr for p in result.fit.curve) > result.fit.curve[0].psnr + 0.3
+    # few texels for the picture: images choose them better than rays do (measured 32.10 -> 32.85 dB)
+    assert max(p.psnr for p in result.fit.curve) > result.fit.curve[0].psnr + 0.5
     np.testing.assert_array_equal(result.asset.meshes[0].positions, low.meshes[0].positions)
     np.testing.assert_array_equal(result.asset.meshes[0].uvs, low.meshes[0].uvs)
     metrics = json.loads((tmp_path / "report" / "report.json").read_text())["metrics"]

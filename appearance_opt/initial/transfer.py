@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from appearance_opt.bake.closed_form import BakedMaps, Settings, bake
-from appearance_opt.bake.points import texel_coverage
+from appearance_opt.baking.closed_form import BakedMaps, Settings, bake
+from appearance_opt.baking.points import texel_coverage
 
 if TYPE_CHECKING:
     from appearance_opt.latent.latent import LatentMesh

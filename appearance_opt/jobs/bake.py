@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from appearance_opt.asset.types import Asset
-    from appearance_opt.bake.closed_form import BakedMaps
-    from appearance_opt.bake.low import Low
+    from appearance_opt.baking.closed_form import BakedMaps
+    from appearance_opt.baking.low import Low
     from appearance_opt.config import BakeOptions
     from appearance_opt.fit.loop import FitResult, Progress
     from appearance_opt.jobs.fitting import Stopwatch
@@ -100,8 +100,8 @@ class _Job:
     """Both assets in one frame; then the closed form, then the fit."""
 
     def __init__(self, high: Asset, low: Asset, name: str, options: BakeOptions, watch: Stopwatch) -> None:
-        from appearance_opt.bake import check
-        from appearance_opt.bake.low import moved, prepare, unwrapped
+        from appearance_opt.baking import check
+        from appearance_opt.baking.low import moved, prepare, unwrapped
         from appearance_opt.jobs.simplify import in_frame, support
         from appearance_opt.reference.mesh import MeshReference
         from appearance_opt.views import ViewSampler, framing
@@ -126,7 +126,7 @@ class _Job:
         watch.lap("reference")
 
     def _aligned(self, high: Asset, low: Asset) -> Asset:
-        from appearance_opt.bake.align import align
+        from appearance_opt.baking.align import align
 
         placed, scale, shift = align(high, low)
         self.notes.append(f"HIGH was scaled by {scale:.6g} and moved by {', '.join(f'{x:.6g}' for x in shift)} m")
@@ -134,7 +134,7 @@ class _Job:
 
     def run(self, progress: Progress | None, with_report: bool) -> tuple[BakeResult, DivergedError | None]:
         """The closed form, and the fit that starts from it."""
-        from appearance_opt.bake.closed_form import bake as bake_closed_form
+        from appearance_opt.baking.closed_form import bake as bake_closed_form
         from appearance_opt.jobs.fitting import clean_maps, fit_start
         from appearance_opt.jobs.start import Start
 
@@ -170,7 +170,7 @@ class _Job:
         return result, error
 
     def _settings(self):
-        from appearance_opt.bake.closed_form import FIELDS, Settings
+        from appearance_opt.baking.closed_form import FIELDS, Settings
 
         o, scale = self.options, self.frame[1]
         wanted = {n for n in FIELDS if o.wants(n)}
@@ -212,8 +212,8 @@ class _Job:
         return {n: v * np.float32(factors[n]) if n in factors else v for n, v in maps.items()}
 
     def _result(self, maps: dict[str, NDArray]) -> Asset:
-        from appearance_opt.bake.encode import material_change
-        from appearance_opt.bake.low import with_material
+        from appearance_opt.baking.encode import material_change
+        from appearance_opt.baking.low import with_material
 
         asset = with_material(self.low.asset, material_change(self._in_metres(maps), self.options))
         if self.options.wants("base-color"):  # the map holds the whole colour: vertex colours would tint it again
@@ -226,7 +226,7 @@ _FITTED = ("red", "green", "blue", "roughness", "metalness", "normal_x", "normal
 
 def _write_loose(result: BakeResult, options: BakeOptions, out: Path, folder: str | Path | None) -> None:
     """Loose files, if asked for or if the format of ``out`` has no place for one of the maps."""
-    from appearance_opt.bake.encode import loose_files
+    from appearance_opt.baking.encode import loose_files
 
     placeless = options.wants("object-normal") or options.wants("curvature") or options.green == "directx"
     placeless |= options.wants("ao") and not options.wants("orm")

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from appearance_opt.bake.points import texel_coverage
+from appearance_opt.baking.points import texel_coverage
 from appearance_opt.errors import DivergedError
 from appearance_opt.fit.loop import FitOptions, FitResult, fit
 from appearance_opt.fit.model import Model, Rates

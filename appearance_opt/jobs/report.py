@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from appearance_opt import backend
-from appearance_opt.bake.encode import coverage_picture
+from appearance_opt.baking.encode import coverage_picture
 from appearance_opt.config import as_dict
 from appearance_opt.evaluate import pictures
 from appearance_opt.evaluate.metrics import compare_images

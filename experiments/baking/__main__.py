@@ -106,7 +106,7 @@ def blender(python: str, source: Path, low: Path, stem: Path, reach: float) -> d
 def angles(stem: Path, theirs: np.ndarray) -> dict:
     """Degrees between two normal maps over covered texels."""
     from appearance_opt import load
-    from appearance_opt.bake.low import prepare
+    from appearance_opt.baking.low import prepare
     from appearance_opt.initial.transfer import texel_coverage
 
     asset = load(f"{stem}_closed.glb")

@@ -13,7 +13,7 @@ from appearance_opt.render import upload
 from appearance_opt.render.surface import face_normal
 
 if TYPE_CHECKING:
-    from appearance_opt.bake.points import Points
+    from appearance_opt.baking.points import Points
     from appearance_opt.latent.latent import LatentMesh
     from appearance_opt.reference.mesh import MeshReference
 
@@ -24,6 +24,9 @@ REACH = 4.0
 """How far rays go, in units of the distance within which nearly all of the reference lies."""
 
 QUANTILE = 0.999
+
+LEAST = 1e-3
+"""Rays go at least this share of the reference's size, for meshes that coincide."""
 
 BACK = 1e-3
 """How far before the surface rays start, in units of their reach."""
@@ -88,9 +91,15 @@ def _facing_hit(
     return prim, b1, b2, distance
 
 
+def automatic_reach(reference: MeshReference, mesh: LatentMesh) -> float:
+    """The automatic cage: ``REACH`` times the distance within which nearly all of the reference lies."""
+    diagonal = float(np.linalg.norm(np.ptp(reference.merged.positions, axis=0)))
+    return max(REACH * deviation(reference, mesh), LEAST * diagonal)
+
+
 def deviation(reference: MeshReference, mesh: LatentMesh) -> float:
     """Distance within which nearly all of the reference (its quantile ``QUANTILE``) lies from the simple
-    mesh, measured along the reference's normals. ``REACH`` times it is the automatic cage."""
+    mesh, measured along the reference's normals."""
     merged = reference.merged
     every = max(1, len(merged.positions) // 50_000)
     p, n = merged.positions[::every], merged.normals[::every]

@@ -13,10 +13,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from appearance_opt.bake.curvature import mean_curvature
-from appearance_opt.bake.occlusion import openness
-from appearance_opt.bake.points import Points, TexelPoints, interpolate_packets
-from appearance_opt.bake.search import REACH, Found, Pick, deviation, find
+from appearance_opt.baking.curvature import mean_curvature
+from appearance_opt.baking.occlusion import openness
+from appearance_opt.baking.points import Points, TexelPoints, interpolate_packets
+from appearance_opt.baking.search import Found, Pick, automatic_reach, find
 from appearance_opt.initial.fill import fill
 from appearance_opt.render import upload
 from appearance_opt.render.rays import sub_pixel_offsets
@@ -80,7 +80,7 @@ def bake(reference: MeshReference, mesh: LatentMesh, settings: Settings) -> Bake
     values = np.empty((size, size, len(names)), np.float32)
     found, covered = np.empty((size, size), bool), np.empty((size, size), bool)
     with dr.suspend_grad():
-        reach = REACH * deviation(reference, mesh) if settings.reach is None else settings.reach
+        reach = automatic_reach(reference, mesh) if settings.reach is None else settings.reach
         run = _Run(reference, TexelPoints(mesh, size, settings.samples), settings, reach)
         for row in range(0, size, run.points.rows):
             sums = run.band(row)[: size - row]

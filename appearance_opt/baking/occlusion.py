@@ -10,7 +10,7 @@ import mitsuba as mi
 from appearance_opt.render.rays import sub_pixel_offsets
 
 if TYPE_CHECKING:
-    from appearance_opt.bake.search import Found
+    from appearance_opt.baking.search import Found
     from appearance_opt.reference.mesh import MeshReference
 
 LIFT = 1e-4
