@@ -347,6 +347,12 @@ def test_options_are_checked(values: dict, words: str, tmp_path: Path) -> None:
         bake_options(**values)
 
 
+def test_the_public_function_is_not_hidden_by_a_package() -> None:
+    import appearance_opt
+
+    assert appearance_opt.bake is bake
+
+
 def test_bake_as_a_user_would(ball: Asset, low_sphere: Asset, tmp_path: Path) -> None:
     save(ball, tmp_path / "high.glb")
     save(low_sphere, tmp_path / "low.glb")

@@ -57,15 +57,14 @@ def make_low(source: Path, triangles: int, path: Path) -> None:
     save(Asset((bare,), "low"), path)
 
 
-def ours(source: Path, low: Path, stem: Path, preset: str) -> dict:
+def ours(source: Path, low: Path, stem: Path, preset: str, steps: int | None) -> dict:
     """Closed form and fit. Returns times and what was found."""
-    from appearance_opt import bake, bake_options, save
+    from appearance_opt import bake, bake_options
 
     closed = bake(source, low, f"{stem}_closed.glb", bake_options(closed_form=True, texture_size=SIZE))
     again = bake(source, low, None, bake_options(closed_form=True, texture_size=SIZE))
     begin = time.perf_counter()
-    fitted = bake(source, low, f"{stem}_fitted.glb", bake_options(preset, texture_size=SIZE))
-    save(fitted.closed_form, f"{stem}_start.glb")
+    fitted = bake(source, low, f"{stem}_fitted.glb", bake_options(preset, texture_size=SIZE, steps=steps))
     assert fitted.fit is not None
     return {
         "missed": closed.missed_share,
@@ -74,6 +73,7 @@ def ours(source: Path, low: Path, stem: Path, preset: str) -> dict:
         "seconds_warm": again.seconds,
         "fit_seconds": time.perf_counter() - begin,
         "fit_steps": fitted.fit.steps,
+        "curve": [(p.seconds, p.step, p.psnr) for p in fitted.fit.curve],
     }
 
 
@@ -129,7 +129,7 @@ def judge(source: Path, candidates: dict[str, str], stem: Path, views: int) -> d
     return dict(zip(candidates, json.loads(scores.read_text())["candidates"], strict=True))
 
 
-def run_row(asset: str, preset: str, python: str | None, views: int) -> dict:
+def run_row(asset: str, preset: str, steps: int | None, python: str | None, views: int) -> dict:
     """One asset, all stages."""
     OUT.mkdir(parents=True, exist_ok=True)
     stem = OUT / asset
@@ -138,8 +138,8 @@ def run_row(asset: str, preset: str, python: str | None, views: int) -> dict:
     source, low = source_of(asset), Path(f"{stem}_low.glb")
     if not low.exists():
         make_low(source, ROWS[asset], low)
-    if row.get("preset") != preset:
-        row.update(ours=ours(source, low, stem, preset), preset=preset)
+    if (row.get("preset"), row.get("steps")) != (preset, steps):
+        row.update(ours=ours(source, low, stem, preset, steps), preset=preset, steps=steps)
         row.pop("scores", None)
         path.write_text(json.dumps(row, indent=1))
     if python is not None and "blender" not in row:
@@ -192,6 +192,7 @@ def main() -> None:
     parser.add_argument("--blender", default=None, metavar="PYTHON")
     parser.add_argument("--rows", default=",".join(ROWS))
     parser.add_argument("--preset", default="default")
+    parser.add_argument("--steps", type=int, default=None, help="instead of the preset's time")
     parser.add_argument("--views", type=int, default=24)
     parser.add_argument("--table", action="store_true")
     a = parser.parse_args()
@@ -202,7 +203,7 @@ def main() -> None:
         return
     if not JUDGE.exists():
         sys.exit(f"{JUDGE} is not there: this experiment needs the neutral renderer and its references")
-    print(tables([run_row(n, a.preset, a.blender, a.views) for n in names]))
+    print(tables([run_row(n, a.preset, a.steps, a.blender, a.views) for n in names]))
 
 
 if __name__ == "__main__":
