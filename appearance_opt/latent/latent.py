@@ -47,14 +47,7 @@ class LatentTopology:
     def __init__(self, mesh: LatentMesh, tangents: bool) -> None:
         self.mesh = mesh
         self.tangents = tangents
-        corner = [mi.UInt32(np.ascontiguousarray(mesh.faces[:, k], np.uint32)) for k in range(3)]
-        frame = [mi.UInt32(np.ascontiguousarray(mesh.frame_faces[:, k], np.uint32)) for k in range(3)]
-        self.corners = Corners(
-            vertex=(corner[0], corner[1], corner[2]),
-            frame=(frame[0], frame[1], frame[2]),
-            frame_vertex=mi.UInt32(np.ascontiguousarray(mesh.frame_vertex, np.uint32)),
-            uvs=mi.Float(np.ascontiguousarray(mesh.uvs, np.float32).ravel()),
-        )
+        self.corners = corners_of(mesh)
         self.faces = upload.index_packets(mesh.faces)
         self.frame_faces = upload.index_packets(mesh.frame_faces)
         # silhouettes run along welded edges: a seam is none
@@ -67,13 +60,12 @@ class LatentTopology:
         ``positions``: it does not move."""
         if self._fixed is not None:
             return self._fixed
-        p = dr.gather(mi.Point3f, positions, dr.arange(mi.UInt32, len(self.mesh.positions)))
         normals = mesh_ops.vertex_normals(positions, self.corners)
-        vertices = _interleave(p.x, p.y, p.z, mi.Float(0), normals.x, normals.y, normals.z, mi.Float(0))
+        vertices = mesh_ops.packed_vertices(positions, normals)
         uv = dr.unravel(mi.Point2f, self.corners.uvs)
         if self.tangents:
             t = mesh_ops.tangent_frames(positions, normals, self.corners)
-            frames = _interleave(uv.x, uv.y, self.handedness, mi.Float(0), t.x, t.y, t.z, mi.Float(0))
+            frames = mesh_ops.interleave(uv.x, uv.y, self.handedness, mi.Float(0), t.x, t.y, t.z, mi.Float(0))
         else:
             frames = self.corners.uvs
         dr.eval(vertices, frames)
@@ -93,6 +85,18 @@ def welded(positions: NDArray, faces: NDArray) -> NDArray[np.intp]:
     """(F, 3) the same faces through one representative vertex per place."""
     first, place = weld(positions)
     return first[place[faces]]
+
+
+def corners_of(mesh: LatentMesh) -> Corners:
+    """Connectivity of a mesh on the device."""
+    corner = [mi.UInt32(np.ascontiguousarray(mesh.faces[:, k], np.uint32)) for k in range(3)]
+    frame = [mi.UInt32(np.ascontiguousarray(mesh.frame_faces[:, k], np.uint32)) for k in range(3)]
+    return Corners(
+        vertex=(corner[0], corner[1], corner[2]),
+        frame=(frame[0], frame[1], frame[2]),
+        frame_vertex=mi.UInt32(np.ascontiguousarray(mesh.frame_vertex, np.uint32)),
+        uvs=mi.Float(np.ascontiguousarray(mesh.uvs, np.float32).ravel()),
+    )
 
 
 def handedness(mesh: LatentMesh) -> NDArray[np.float32]:
@@ -119,7 +123,3 @@ def local_edge_length(positions: NDArray, faces: NDArray) -> NDArray[np.float32]
     used = count > 0
     mean = length[used].sum() / max(count[used].sum(), 1)
     return np.where(used, length / np.maximum(count, 1), mean).astype(np.float32)
-
-
-def _interleave(*columns: mi.Float) -> mi.Float:
-    return dr.ravel(mi.ArrayXf(list(columns)), order="F")

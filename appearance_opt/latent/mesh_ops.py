@@ -33,10 +33,10 @@ def vertex_normals(positions: mi.Float, corners: Corners) -> mi.Vector3f:
     """Unit normals (V) of flat positions (3 V): face normals weighted by the corner's angle. A vertex
     whose normals cancel, or that no face uses, gets +Z."""
     p = [dr.gather(mi.Point3f, positions, i) for i in corners.vertex]
-    normal = _unit(dr.cross(p[1] - p[0], p[2] - p[0]))
+    normal = unit(dr.cross(p[1] - p[0], p[2] - p[0]))
     total = dr.zeros(mi.Float, dr.width(positions))
     for k in range(3):
-        angle = _angle(_unit(p[(k + 1) % 3] - p[k]), _unit(p[(k + 2) % 3] - p[k]))
+        angle = _angle(unit(p[(k + 1) % 3] - p[k]), unit(p[(k + 2) % 3] - p[k]))
         dr.scatter_add(total, normal * angle, corners.vertex[k])
     summed = dr.unravel(mi.Vector3f, total)
     squared = dr.squared_norm(summed)
@@ -57,8 +57,8 @@ def tangent_frames(positions: mi.Float, normals: mi.Vector3f, corners: Corners) 
     for k in range(3):
         n = dr.gather(mi.Vector3f, normals, corners.vertex[k])
         edge, other = p[(k + 1) % 3] - p[k], p[(k + 2) % 3] - p[k]
-        angle = _angle(_unit(_in_plane(edge, n)), _unit(_in_plane(other, n)))
-        value = dr.select(usable, _unit(_in_plane(along_u, n)) * angle, 0)
+        angle = _angle(unit(_in_plane(edge, n)), unit(_in_plane(other, n)))
+        value = dr.select(usable, unit(_in_plane(along_u, n)) * angle, 0)
         dr.scatter_add(total, value, corners.frame[k])
     summed = dr.unravel(mi.Vector3f, total)
     squared = dr.squared_norm(summed)
@@ -68,11 +68,22 @@ def tangent_frames(positions: mi.Float, normals: mi.Vector3f, corners: Corners) 
     return dr.select(ok, summed * dr.rsqrt(dr.select(ok, squared, 1)), fallback)
 
 
+def packed_vertices(positions: mi.Float, normals: mi.Vector3f) -> mi.Float:
+    """Positions and normals of all vertices as packets (8 V): position, 0, normal, 0."""
+    p = dr.unravel(mi.Point3f, positions)
+    return interleave(p.x, p.y, p.z, mi.Float(0), normals.x, normals.y, normals.z, mi.Float(0))
+
+
+def interleave(*columns: mi.Float) -> mi.Float:
+    """Columns as packets, one after the other."""
+    return dr.ravel(mi.ArrayXf(list(columns)), order="F")
+
+
 def _in_plane(v: mi.Vector3f, n: mi.Vector3f) -> mi.Vector3f:
     return v - n * dr.dot(n, v)
 
 
-def _unit(v: mi.Vector3f) -> mi.Vector3f:
+def unit(v: mi.Vector3f) -> mi.Vector3f:
     """v / |v|, and zero with a zero gradient where v is (nearly) zero."""
     squared = dr.squared_norm(v)
     ok = squared > 1e-30

@@ -29,6 +29,7 @@ BOUNDS = {
     "normal_x": (-1.0, 1.0),
     "normal_y": (-1.0, 1.0),
     "normal_z": (0.05, 1.0),
+    "displacement": (-1.0, 1.0),
 }
 MAX_LEVELS = 7
 """Levels of a fitted pyramid: no view minifies an atlas by more than 2^6."""

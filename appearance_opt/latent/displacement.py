@@ -1,0 +1,107 @@
+"""The tessellated, displaced mesh: v_i^d = v_i + tex2d(t_i) n_i (Hasselgren et al. 2021, equation 3).
+
+v_i and n_i are position and unit normal interpolated from the base mesh, whose vertices may move; tex2d is a
+scalar map in the units of the positions. A vertex on a UV seam has several texture coordinates t_i: its
+displacement is the mean of their lookups, so that it stays one vertex and no seam can open.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from appearance_opt.latent import mesh_ops
+from appearance_opt.latent.latent import LatentMesh, LatentTopology, corners_of
+from appearance_opt.latent.subdivision import tessellate
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from appearance_opt.render.material import TexelLayer
+
+DISPLACEMENT = "displacement"
+"""Name of the channel."""
+
+
+class Tessellator:
+    """From base positions and a displacement map to the positions of one tessellation level.
+
+    ``topology``: connectivity of the tessellated mesh, which makes normals and tangent frames of the
+    displaced surface. All else is precomputed: base vertices and weights of each vertex, where it reads
+    the map and how finely.
+    """
+
+    def __init__(self, base: LatentMesh, level: int, tangents: bool) -> None:
+        fine = tessellate(base, level)
+        self.level = level
+        self.topology = LatentTopology(fine.mesh, tangents)
+        self._base = corners_of(base)
+        self._parents = [mi.UInt32(np.ascontiguousarray(fine.parents[:, k], np.uint32)) for k in range(3)]
+        self._weights = [mi.Float(np.ascontiguousarray(fine.weights[:, k])) for k in range(3)]
+        self._uv = mi.Point2f(np.ascontiguousarray(fine.mesh.uvs.T))
+        self._footprint = mi.Float(footprint(fine.mesh))
+        self._vertex = mi.UInt32(np.ascontiguousarray(fine.mesh.frame_vertex, np.uint32))
+        self._share = mi.Float(share(fine.mesh))
+        dr.eval(self._parents, self._weights, self._uv, self._footprint, self._vertex, self._share)
+
+    def __call__(self, positions: mi.Float, relief: TexelLayer | None) -> mi.Float:
+        """Flat positions (3 N) of the tessellated mesh from flat base positions (3 V) and the displacement
+        map; differentiable in the positions (also through the normals) and the map's texels."""
+        if relief is None:
+            point, _ = self._interpolated(positions, False)
+            return dr.ravel(point)
+        point, normal = self._interpolated(positions, True)
+        return dr.ravel(point + normal * self.amount(relief))
+
+    def amount(self, relief: TexelLayer) -> mi.Float:
+        """Displacement (N) of each vertex: the mean of its render vertices' lookups."""
+        value = relief.pyramid.lookup(None, self._uv, self._footprint)[relief.channels.index(DISPLACEMENT)]
+        total = dr.zeros(mi.Float, len(self.topology.mesh.positions))
+        dr.scatter_add(total, value * self._share, self._vertex)
+        return total
+
+    def _interpolated(self, positions: mi.Float, with_normals: bool) -> tuple[mi.Point3f, mi.Vector3f]:
+        """Position and unit normal of each vertex without displacement."""
+        if not with_normals:
+            rows = [self._row(positions, k, 3) for k in range(3)]
+            return mi.Point3f(*self._mix(rows, 0)), mi.Vector3f(0)
+        base = mesh_ops.packed_vertices(positions, mesh_ops.vertex_normals(positions, self._base))
+        rows = [self._row(base, k, 8) for k in range(3)]
+        return mi.Point3f(*self._mix(rows, 0)), mesh_ops.unit(mi.Vector3f(*self._mix(rows, 4)))
+
+    def _row(self, buffer: mi.Float, parent: int, channels: int) -> mi.ArrayXf:
+        # Expand: hundreds of vertices hang on one base vertex, whose gradient atomics would serialise
+        index = self._parents[parent]
+        if channels == 3:
+            return mi.ArrayXf(dr.gather(mi.Point3f, buffer, index, mode=dr.ReduceMode.Expand))
+        return dr.gather(mi.ArrayXf, buffer, index, mode=dr.ReduceMode.Expand, shape=(channels, dr.width(index)))
+
+    def _mix(self, rows: list[mi.ArrayXf], first: int) -> list[mi.Float]:
+        w = self._weights
+        return [dr.fma(rows[0][c], w[0], dr.fma(rows[1][c], w[1], rows[2][c] * w[2])) for c in range(first, first + 3)]
+
+
+def footprint(mesh: LatentMesh) -> NDArray[np.float32]:
+    """(R,) UV area that a render vertex stands for: the square of the mean UV length of its edges. A lookup
+    with it reads the mip level at which one texel is as long as one edge: finer texels could not be
+    told apart by this mesh, and would alias."""
+    length, count = np.zeros(len(mesh.uvs)), np.zeros(len(mesh.uvs))
+    for a, b in ((0, 1), (1, 2), (2, 0)):
+        i, j = mesh.frame_faces[:, a], mesh.frame_faces[:, b]
+        edge = np.linalg.norm(mesh.uvs[i].astype(np.float64) - mesh.uvs[j], axis=1)
+        for k in (i, j):
+            length += np.bincount(k, edge, len(length))
+            count += np.bincount(k, minlength=len(count))
+    return np.square(length / np.maximum(count, 1)).astype(np.float32)
+
+
+def share(mesh: LatentMesh) -> NDArray[np.float32]:
+    """(R,) one over the number of render vertices of the same vertex, those counted that a face uses; 0 for
+    the others."""
+    used = np.zeros(len(mesh.uvs), bool)
+    used[mesh.frame_faces.ravel()] = True
+    count = np.bincount(mesh.frame_vertex[used], minlength=len(mesh.positions))
+    return np.where(used, 1 / np.maximum(count, 1)[mesh.frame_vertex], 0).astype(np.float32)
