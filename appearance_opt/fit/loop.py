@@ -17,6 +17,8 @@ from appearance_opt.fit.model import POSITIONS, Model
 from appearance_opt.fit.schedule import Clock, laplacian_weight, learning_rate
 from appearance_opt.fit.step import StepInputs, first_non_finite, step
 from appearance_opt.fit.validation import Validation
+from appearance_opt.latent.displacement import DISPLACEMENT
+from appearance_opt.latent.latent import local_edge_length
 from appearance_opt.render.deferred import Grid
 from appearance_opt.render.gradient import Quality
 
@@ -130,10 +132,9 @@ class _Run:
         self.grid = Grid(pool.batch, pool.resolution)
         self.result = FitResult()
         self.state = FitState(moments={n: adam.moments_of(p) for n, p in model.parameters.items()})
-        self.laplacian: Laplacian | None = None
-        if POSITIONS in model.parameters and options.laplacian > 0:
-            mesh = model.topology.mesh
-            self.laplacian = Laplacian(mesh.positions, mesh.faces, model.edge_length, options.relative)
+        self.laplacians: dict[int, Laplacian] = {}
+        if {POSITIONS, DISPLACEMENT} & set(model.parameters) and options.laplacian > 0:
+            self.laplacians = laplacians(model, options.relative)
         if checkpointer is not None and checkpointer.restore(model, self.state):
             self.result.curve = [CurvePoint(*p) for p in self.state.curve]
         self.clock = Clock(options.steps, options.seconds, self.state.seconds)
@@ -146,6 +147,8 @@ class _Run:
         state, options = self.state, self.options
         fraction = self.clock.progress(state.iteration)
         views, reference = self.pool.draw(state.iteration)
+        self.model.select(level_of(self.model.levels, options.seed, state.iteration))
+        laplacian = self.laplacians.get(self.model.level)
         inputs = StepInputs(
             views=views,
             reference=reference,
@@ -156,12 +159,12 @@ class _Run:
             want_loss=state.iteration % LOSS_EVERY == 0 or state.laplacian == 0,
         )
         done = step(
-            self.model, state.moments, self.grid, options.quality, self.loss, self.laplacian, inputs, first_non_finite
+            self.model, state.moments, self.grid, options.quality, self.loss, laplacian, inputs, first_non_finite
         )
         self._count(done.bad)
         if done.bad is None and done.loss is not None:
             state.loss = done.loss
-            if state.laplacian == 0 and self.laplacian is not None:
+            if state.laplacian == 0 and laplacian is not None:
                 # a deviation of a tenth of an edge length costs this fraction of the first image loss
                 state.laplacian = options.laplacian * done.loss / 0.01
         state.iteration += 1
@@ -229,6 +232,22 @@ class _Run:
         self.progress.update(
             state.iteration, fraction, state.loss, self.psnr, state.iteration / max(seconds, 1e-9), left
         )
+
+
+def level_of(levels: tuple[int, ...], seed: int, iteration: int) -> int:
+    """The tessellation level of an iteration: drawn at random, the same whenever it is replayed."""
+    if len(levels) == 1:
+        return levels[0]
+    return levels[int(np.random.default_rng([seed, 13, iteration]).integers(len(levels)))]
+
+
+def laplacians(model: Model, relative: bool) -> dict[int, Laplacian]:
+    """The regularizer of each tessellation level, on the displaced mesh, relative to it as it is now."""
+    out = {}
+    for level in model.levels:
+        mesh, positions = model.host_drawn(level)
+        out[level] = Laplacian(positions, mesh.faces, local_edge_length(positions, mesh.faces), relative)
+    return out
 
 
 def backgrounds(background: Background, count: int, seed: int, iteration: int) -> NDArray[np.float32]:

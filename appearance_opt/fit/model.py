@@ -9,6 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from appearance_opt.latent.displacement import DISPLACEMENT, Tessellator
 from appearance_opt.latent.latent import LatentMesh, LatentTopology, local_edge_length
 from appearance_opt.latent.parameter import Parameter
 from appearance_opt.latent.texels import BOUNDS, TexelCodec
@@ -29,12 +30,14 @@ POSITIONS, TEXELS = "positions", "texels"
 @dataclass(frozen=True)
 class Rates:
     """Learning rates at the start of a fit. ``position``: in units of the local edge length;
-    the others in the units of their maps (colours: square root of linear)."""
+    ``displacement``: in units of the mean edge length of the finest tessellation; the others in the units
+    of their maps (colours: square root of linear)."""
 
     position: float = 0.01
     normal: float = 0.01
     base_color: float = 0.005
     material: float = 0.005
+    displacement: float = 0.01
 
     def of_channel(self, name: str) -> float:
         """Rate of a texel channel."""
@@ -43,40 +46,65 @@ class Rates:
         return self.base_color if name in ("red", "green", "blue") else self.material
 
 
+@dataclass(frozen=True)
+class Shape:
+    """Where the drawn mesh is, on the device: flat base ``positions`` (3 V) and the pyramid ``relief`` of the
+    displacement map, None without one. Either may carry gradients."""
+
+    positions: mi.Float
+    relief: TexelLayer | None
+
+
+class Drawn:
+    """One tessellation level, ready to be traced. Level 0 without displacement is the latent mesh itself."""
+
+    def __init__(self, mesh: LatentMesh, level: int, displaced: bool, tangents: bool) -> None:
+        self.tessellator = Tessellator(mesh, level, tangents) if displaced or level else None
+        self.topology = LatentTopology(mesh, tangents) if self.tessellator is None else self.tessellator.topology
+        drawn = self.topology.mesh
+        self.edge_length = local_edge_length(drawn.positions, drawn.faces)
+        self.scene = upload.scene_of(drawn.positions, drawn.faces)
+        self._parameters = mi.traverse(self.scene)
+
+    def pose(self, shape: Shape) -> mi.Float:
+        """Flat positions (3 N) of the drawn mesh; differentiable."""
+        return shape.positions if self.tessellator is None else self.tessellator(shape.positions, shape.relief)
+
+    def move(self, posed: mi.Float) -> None:
+        """Rebuild the BVH at the given positions."""
+        self._parameters["mesh.vertex_positions"] = posed
+        self._parameters.update()
+
+
 class Model:
     """A latent mesh with maps, of which the parts named in ``fit`` are parameters.
 
-    ``fit``: subset of {"shape", "normal", "material", "gamma"}. ``maps``: natural values of every map the
-    latent has, channel name -> (size, size), or a number for a channel that is constant. Maps that
-    are not fitted are kept in a layer of their own, without gradients or moments.
+    ``fit``: subset of {"shape", "normal", "material", "gamma", "displacement"}. ``maps``: natural values of
+    every map the latent has, channel name -> (size, size), or a number for a channel that is constant. Maps
+    that are not fitted are kept in a layer of their own, without gradients or moments. The map
+    "displacement" has a size of its own; with it, or with ``levels`` other than (0,), the mesh is
+    drawn tessellated, at one of ``levels`` at a time (``select``).
     """
 
     def __init__(
-        self, mesh: LatentMesh, maps: Mapping[str, NDArray | float], fit: frozenset[str], rates: Rates
+        self,
+        mesh: LatentMesh,
+        maps: Mapping[str, NDArray | float],
+        fit: frozenset[str],
+        rates: Rates,
+        levels: tuple[int, ...] = (0,),
     ) -> None:
         images = {n: np.asarray(maps[n]) for n in CHANNELS if n in maps and np.ndim(maps[n])}
         self.constants = {n: float(v) for n, v in maps.items() if not np.ndim(v)}
         fitted = tuple(n for n in images if _group(n) in fit)
-        self.topology = LatentTopology(mesh, tangents="normal_x" in images)
+        self.mesh, self.levels, self.level = mesh, levels, levels[-1]
+        self._drawn = {k: Drawn(mesh, k, DISPLACEMENT in maps, "normal_x" in images) for k in levels}
         self.edge_length = local_edge_length(mesh.positions, mesh.faces)
-        self.scene = upload.scene_of(mesh.positions, mesh.faces)
-        self._scene_parameters = mi.traverse(self.scene)
         self._fixed_positions = mi.Float(np.ascontiguousarray(mesh.positions, np.float32).ravel())
         self.parameters: dict[str, Parameter] = {}
         if "shape" in fit:
             self.parameters[POSITIONS] = Parameter(POSITIONS, mi.Float(self._fixed_positions), 1, mi.Float(0))
-        self.codec: TexelCodec | None = None
-        if fitted:
-            codec = TexelCodec(fitted, len(images[fitted[0]]))
-            self.codec = codec
-            self.parameters[TEXELS] = Parameter(
-                TEXELS,
-                codec.encode(images),
-                codec.packed,
-                mi.Float(0),
-                codec.per_channel({n: BOUNDS[n][0] for n in fitted}),
-                codec.per_channel({n: BOUNDS[n][1] for n in fitted}),
-            )
+        self.codec = self._texel_parameter(TEXELS, fitted, images) if fitted else None
         self._initial_texels = np.array(self.parameters[TEXELS].value) if fitted else np.empty(0, np.float32)
         self._fixed_layers: tuple[TexelLayer, ...] = ()
         self._fixed_maps = {n: v.astype(np.float32) for n, v in images.items() if n not in fitted}
@@ -84,7 +112,53 @@ class Model:
             names = tuple(self._fixed_maps)
             fixed = TexelCodec(names, len(self._fixed_maps[names[0]]))
             self._fixed_layers = (fixed.layer(fixed.encode(self._fixed_maps)),)
+        self._relief_codec: TexelCodec | None = None
+        self._fixed_relief: TexelLayer | None = None
+        if DISPLACEMENT in maps:
+            self._relief_codec = self._relief(np.asarray(maps[DISPLACEMENT]), DISPLACEMENT in fit)
         self.set_rates(rates)
+        for drawn in self._drawn.values():
+            drawn.move(drawn.pose(self.shape()))
+
+    def _texel_parameter(self, name: str, channels: tuple[str, ...], images: Mapping[str, NDArray]) -> TexelCodec:
+        codec = TexelCodec(channels, len(images[channels[0]]))
+        self.parameters[name] = Parameter(
+            name,
+            codec.encode(images),
+            codec.packed,
+            mi.Float(0),
+            codec.per_channel({n: BOUNDS[n][0] for n in channels}),
+            codec.per_channel({n: BOUNDS[n][1] for n in channels}),
+        )
+        return codec
+
+    def _relief(self, image: NDArray, fitted: bool) -> TexelCodec:
+        if fitted:
+            return self._texel_parameter(DISPLACEMENT, (DISPLACEMENT,), {DISPLACEMENT: image})
+        codec = TexelCodec((DISPLACEMENT,), len(image))
+        self._fixed_relief = codec.layer(codec.encode({DISPLACEMENT: image}))
+        return codec
+
+    @property
+    def drawn(self) -> Drawn:
+        """The tessellation that is drawn now."""
+        return self._drawn[self.level]
+
+    @property
+    def topology(self) -> LatentTopology:
+        """Connectivity of the drawn mesh."""
+        return self.drawn.topology
+
+    @property
+    def scene(self) -> mi.Scene:
+        """The drawn mesh, for tracing rays."""
+        return self.drawn.scene
+
+    def select(self, level: int) -> None:
+        """Draw another tessellation level from now on."""
+        if level != self.level:
+            self.level = level
+            self.update_scene()
 
     def set_rates(self, rates: Rates) -> None:
         """Change the learning rates of all parameters."""
@@ -94,20 +168,53 @@ class Model:
         if self.codec is not None:
             per_channel = {n: rates.of_channel(n) for n in self.codec.channels}
             self.parameters[TEXELS].rate = self.codec.per_channel(per_channel)
+        if DISPLACEMENT in self.parameters:
+            edge = float(self._drawn[max(self.levels)].edge_length.mean())
+            self.parameters[DISPLACEMENT].rate = mi.Float(edge * rates.displacement)
 
     def positions(self) -> mi.Float:
-        """Current flat positions (3 V)."""
+        """Current flat base positions (3 V)."""
         return self.parameters[POSITIONS].value if POSITIONS in self.parameters else self._fixed_positions
+
+    def shape(self) -> Shape:
+        """Copies of what places the drawn mesh; those that are parameters can be differentiated."""
+        relief = self._fixed_relief
+        if DISPLACEMENT in self.parameters:
+            assert self._relief_codec is not None
+            relief = self._relief_codec.layer(self.parameters[DISPLACEMENT].value)
+        return Shape(mi.Float(self.positions()), relief)
+
+    def track(self, shape: Shape) -> Shape:
+        """Attach gradients to those parts of a shape that are parameters."""
+        if POSITIONS in self.parameters:
+            dr.enable_grad(shape.positions)
+        if DISPLACEMENT in self.parameters and shape.relief is not None:
+            dr.enable_grad(shape.relief.pyramid.texels)
+        return shape
+
+    def shape_gradients(self, shape: Shape) -> dict[str, mi.Float]:
+        """Gradients of the parameters of a tracked shape, after the backward pass."""
+        out = {}
+        if POSITIONS in self.parameters:
+            out[POSITIONS] = dr.grad(shape.positions)
+        if DISPLACEMENT in self.parameters:
+            assert shape.relief is not None and self._relief_codec is not None
+            gradient = dr.grad(shape.relief.pyramid.texels)
+            out[DISPLACEMENT] = self._relief_codec.pull_back(gradient, self.parameters[DISPLACEMENT].value)
+        return out
+
+    def posed(self) -> mi.Float:
+        """Flat positions (3 N) of the drawn mesh as it is now."""
+        return self.drawn.pose(self.shape())
 
     def update_scene(self) -> None:
         """Move the traced mesh to the current positions (rebuilds its BVH)."""
-        if POSITIONS in self.parameters:
-            self._scene_parameters["mesh.vertex_positions"] = self.positions()
-            self._scene_parameters.update()
+        if POSITIONS in self.parameters or DISPLACEMENT in self.parameters:
+            self.drawn.move(self.posed())
 
-    def surface(self, positions: mi.Float) -> Surface:
-        """Surface at flat positions (3 V), differentiable in them."""
-        return self.topology.surface(positions)
+    def surface(self, posed: mi.Float) -> Surface:
+        """Surface at flat positions (3 N) of the drawn mesh, differentiable in them."""
+        return self.topology.surface(posed)
 
     def fitted_layer(self) -> TexelLayer | None:
         """The maps that are parameters, as a fresh pyramid."""
@@ -119,8 +226,22 @@ class Model:
         return MaterialMaps(layers, self.constants)
 
     def host_positions(self) -> NDArray[np.float32]:
-        """Current positions (V, 3)."""
+        """Current base positions (V, 3)."""
         return np.array(self.positions()).reshape(-1, 3)
+
+    def host_drawn(self, level: int) -> tuple[LatentMesh, NDArray[np.float32]]:
+        """Mesh of a tessellation level and its current positions (N, 3)."""
+        drawn = self._drawn[level]
+        return drawn.topology.mesh, np.array(drawn.pose(self.shape())).reshape(-1, 3)
+
+    def host_displacement(self) -> NDArray[np.float32] | None:
+        """Current displacement map (size, size) in the units of the positions, or None."""
+        if self._relief_codec is None:
+            return None
+        layer = self.shape().relief
+        assert layer is not None
+        size = self._relief_codec.size
+        return np.array(layer.pyramid.texels)[: size * size].reshape(size, size)
 
     def host_maps(self) -> dict[str, NDArray[np.float32]]:
         """Current maps in natural units, channel name -> (size, size), fitted or not."""

@@ -11,7 +11,7 @@ import numpy as np
 
 from appearance_opt.fit import adam
 from appearance_opt.fit.losses import covered_loss, image_loss
-from appearance_opt.fit.model import POSITIONS, TEXELS, Model
+from appearance_opt.fit.model import TEXELS, Model
 from appearance_opt.render import gradient
 
 if TYPE_CHECKING:
@@ -55,11 +55,10 @@ def gradients(
     """Mean image loss (width 1; only part of it without ``want_loss``) and the gradient of every parameter."""
     records = inputs.views.records()
     layer = model.fitted_layer()
-    positions = mi.Float(model.positions())
-    moving = POSITIONS in model.parameters
-    if moving:
-        dr.enable_grad(positions)
-    surface = model.surface(positions)
+    shape = model.track(model.shape())
+    posed = model.drawn.pose(shape)
+    moving = dr.grad_enabled(posed)
+    surface = model.surface(posed)
     if layer is not None:
         dr.enable_grad(layer.pyramid.texels)
     maps = model.maps(layer)
@@ -81,13 +80,11 @@ def gradients(
     if direct is not None:
         terms.append(direct)
     if moving and laplacian is not None:
-        terms.append(laplacian.per_vertex(positions) * dr.opaque(mi.Float, inputs.laplacian_weight))
+        terms.append(laplacian.per_vertex(posed) * dr.opaque(mi.Float, inputs.laplacian_weight))
     gradient.backward(terms)
     if direct is not None and inputs.want_loss:
         value += dr.sum(dr.detach(direct))
-    out: dict[str, mi.Float] = {}
-    if moving:
-        out[POSITIONS] = dr.grad(positions)
+    out = model.shape_gradients(shape)
     if layer is not None and model.codec is not None:
         out[TEXELS] = model.codec.pull_back(dr.grad(layer.pyramid.texels), model.parameters[TEXELS].value)
     dr.eval(value, out)

@@ -30,14 +30,23 @@ class Validation:
 
     def render(self, model: Model) -> NDArray[np.float32]:
         """The model in the held-out views: (B, H, W, 4) premultiplied linear radiance and coverage."""
-        surface = model.surface(model.positions())
+        surface = model.surface(model.posed())
         maps = model.maps(model.fitted_layer())
         image = render_image(model.scene, surface, maps, self.views.records(), self._grid, self.samples)
         return np.array(image).reshape(len(self.views), self.resolution, self.resolution, 4)
 
     def psnr(self, model: Model) -> float:
         """Mean over the views of the PSNR in dB of display values (sRGB, clipped) over the pixels that
-        either image covers."""
+        either image covers; with several tessellation levels also over those."""
+        current = model.level
+        each = []
+        for level in model.levels:
+            model.select(level)
+            each.append(self._psnr(model))
+        model.select(current)
+        return float(np.mean(each))
+
+    def _psnr(self, model: Model) -> float:
         image = self.render(model)
         error = np.mean((display(image) - self._reference) ** 2, axis=-1)
         either = self._covered | (image[..., 3] > 0)

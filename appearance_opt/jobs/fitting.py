@@ -127,7 +127,7 @@ def clean_maps(model: Model, known: NDArray) -> dict:
     if not maps:
         return out
     names = list(maps)
-    inside = texel_coverage(model.topology.mesh, len(maps[names[0]]))
+    inside = texel_coverage(model.mesh, len(maps[names[0]]))
     seen = model.touched(inside, known)
     stacked = fill(np.stack([maps[n] for n in names], axis=-1), seen)
     out.update({n: stacked[..., k] for k, n in enumerate(names)})

@@ -70,7 +70,8 @@ def tangent_frames(positions: mi.Float, normals: mi.Vector3f, corners: Corners) 
 
 def packed_vertices(positions: mi.Float, normals: mi.Vector3f) -> mi.Float:
     """Positions and normals of all vertices as packets (8 V): position, 0, normal, 0."""
-    p = dr.unravel(mi.Point3f, positions)
+    # not dr.unravel: its derivative overwrites what other uses of the same positions have handed back
+    p = dr.gather(mi.Point3f, positions, dr.arange(mi.UInt32, dr.width(positions) // 3))
     return interleave(p.x, p.y, p.z, mi.Float(0), normals.x, normals.y, normals.z, mi.Float(0))
 
 
