@@ -18,6 +18,7 @@ LOSS_NAMES = ("log-srgb-l1", "log-srgb-l2", "l1", "l2", "smape", "relative-l2")
 BACKGROUNDS = ("random", "black", "white", "grey")
 LIGHTS = ("point", "headlight")
 DEVICES = ("auto", "cpu", "cuda")
+MAX_SUBDIVISION, DEFAULT_SUBDIVISION = 4, 3
 MAPS = ("normal", "material", "base-color", "orm", "displacement", "object-normal", "ao", "curvature")
 HITS = ("nearest", "outermost")
 GREENS = ("opengl", "directx")
@@ -40,8 +41,9 @@ class CommonOptions:
     views of a step. ``steps``, ``budget`` (seconds for the whole job, set-up and report included): when to stop;
     whichever comes first. ``pool``: number of reference views rendered (each is used many times). ``fit``: what
     moves. ``*_rate``: learning rates, positions in units of the local edge length; by default they follow from how
-    good the start is. ``refine``: level for USD subdivision surfaces. Raises InputError for values that make no
-    sense.
+    good the start is. ``refine``: level for USD subdivision surfaces. ``subdivision``: tessellation levels of a
+    displaced result (none given: 3); ``write_tessellated``: write those meshes, too. Raises InputError for values
+    that make no sense.
     """
 
     texture_size: int = 1024
@@ -56,10 +58,13 @@ class CommonOptions:
     normal_rate: float | None = None
     color_rate: float | None = None
     material_rate: float | None = None
+    displacement_rate: float | None = None
     background: str = "random"
     light: str = "point"
     seed: int = 0
     refine: int = 1
+    subdivision: tuple[int, ...] = ()
+    write_tessellated: bool = False
     device: str = "auto"
 
     def __post_init__(self) -> None:
@@ -71,7 +76,11 @@ class CommonOptions:
         _require(self.steps is None or self.steps >= 0, "steps", self.steps, "0 or more")
         _require(self.budget is None or self.budget > 0, "budget", self.budget, "a positive time such as 60s")
         _require(0 <= self.refine <= 5, "refine", self.refine, "from 0 to 5")
-        for name in ("position_rate", "normal_rate", "color_rate", "material_rate"):
+        for level in self.subdivision:
+            _require(0 <= level <= MAX_SUBDIVISION, "subdivision", level, f"from 0 to {MAX_SUBDIVISION}")
+        _require(self.displaced or not self.subdivision, "subdivision", self.subdivision, self._needs)
+        _require(self.displaced or not self.write_tessellated, "write-tessellated", "", self._needs)
+        for name in ("position_rate", "normal_rate", "color_rate", "material_rate", "displacement_rate"):
             rate = getattr(self, name)
             _require(rate is None or 0 <= rate <= 1, name.replace("_", "-"), rate, "from 0 to 1")
         for part in self.fit:
@@ -80,6 +89,19 @@ class CommonOptions:
         _choice("light", self.light, LIGHTS)
         _choice("device", self.device, DEVICES)
         self.background_color()
+
+    _needs = "given with a displacement"
+
+    @property
+    def displaced(self) -> bool:
+        """Is a displacement map fitted, and the mesh tessellated?"""
+        return False
+
+    def levels(self) -> tuple[int, ...]:
+        """Tessellation levels at which the latent is drawn, in ascending order."""
+        if not self.displaced:
+            return (0,)
+        return tuple(sorted(set(self.subdivision))) or (DEFAULT_SUBDIVISION,)
 
     def background_color(self) -> str | tuple[float, float, float]:
         """A name, or linear RGB."""
@@ -101,7 +123,8 @@ class SimplifyOptions(CommonOptions):
     ``triangles`` or ``ratio``: the budget (exactly one). ``init``: "decimate", "sphere", or a file with a start.
     ``reallocate``: rounds in which triangles are moved to where the image error of the decimated mesh is.
     ``relative``: the Laplacian keeps the start's shape (a sphere start uses the absolute one unless told
-    otherwise). ``keep_hidden``: keep geometry that no outside view sees. The others: ``CommonOptions``.
+    otherwise). ``keep_hidden``: keep geometry that no outside view sees. ``displacement``: fit a displacement map
+    on the tessellated mesh; ``normal_map``: make one at all. The others: ``CommonOptions``.
     """
 
     triangles: int | None = None
@@ -111,9 +134,18 @@ class SimplifyOptions(CommonOptions):
     laplacian: float = 0.25
     relative: bool | None = None
     keep_hidden: bool = False
+    displacement: bool = False
+    normal_map: bool = True
+
+    _needs = "given together with --displacement"
+
+    @property
+    def displaced(self) -> bool:
+        return self.displacement
 
     def __post_init__(self) -> None:
-        if (self.triangles is None) == (self.ratio is None):
+        given = (self.triangles is not None) + (self.ratio is not None)
+        if given != 1 and (self.init in INITS or given):  # a file to start from brings its own triangles
             raise InputError("give either --triangles N or --ratio R")
         if self.triangles is not None:
             _require(self.triangles >= 4, "triangles", self.triangles, "at least 4")
@@ -135,7 +167,8 @@ class BakeOptions(CommonOptions):
     "outermost" surface that faces the texel's way. ``green``: green channel of loose normal maps, "opengl" or
     "directx". ``bits``: 8 or 16, of normal maps and of loose maps. ``texture_format``: of loose maps, png or exr.
     ``ao_rays``, ``ao_distance`` (metres; by default any): ambient occlusion. ``unwrap``: make a new atlas for LOW.
-    ``align``: fit HIGH to LOW by translation and scale. The others: ``CommonOptions``; ``fit``: of normal,material.
+    ``align``: fit HIGH to LOW by translation and scale. ``joint``: fit LOW's shape and a displacement map as well.
+    The others: ``CommonOptions``; ``fit``: of normal,material.
     """
 
     maps: tuple[str, ...] = ("normal", "material")
@@ -151,9 +184,17 @@ class BakeOptions(CommonOptions):
     ao_distance: float | None = None
     unwrap: bool = False
     align: bool = False
+    joint: bool = False
+
+    _needs = "given together with --joint"
+
+    @property
+    def displaced(self) -> bool:
+        return self.joint
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        _require(not (self.joint and self.closed_form), "joint", "", "given without --closed-form")
         _require(bool(self.maps), "maps", "", f"some of {', '.join(MAPS)}")
         for name in self.maps:
             _choice("maps", name, MAPS)
@@ -174,7 +215,7 @@ class BakeOptions(CommonOptions):
 
 
 OPTION_NAMES = frozenset(f.name for f in fields(SimplifyOptions))
-BAKE_OPTION_NAMES = frozenset(f.name for f in fields(BakeOptions)) - {"position_rate"}
+BAKE_OPTION_NAMES = frozenset(f.name for f in fields(BakeOptions))
 
 
 def simplify_options(preset: str = "default", **values: Any) -> SimplifyOptions:
@@ -247,6 +288,8 @@ def _converted(kind: type, name: str, value: Any) -> Any:
     if name in ("fit", "maps"):
         parts = value.split(",") if isinstance(value, str) else value
         return tuple(dict.fromkeys(p.strip() for p in parts if p.strip()))
+    if name == "subdivision":
+        return _levels(value)
     kinds: Mapping[str, tuple[type, ...]] = {"int": (int,), "float": (int, float), "str": (str,), "bool": (bool,)}
     declared = str(next(f.type for f in fields(kind) if f.name == name))
     allowed = tuple(k for word, types in kinds.items() if word in declared for k in types)
@@ -255,6 +298,15 @@ def _converted(kind: type, name: str, value: Any) -> Any:
     if allowed and (not isinstance(value, allowed) or (isinstance(value, bool) and bool not in allowed)):
         raise InputError(f"--{name.replace('_', '-')} {value!r}: expected {declared}")
     return value
+
+
+def _levels(value: Any) -> tuple[int, ...]:
+    """Tessellation levels of 3, "1,2,3" or a list."""
+    parts = value.split(",") if isinstance(value, str) else value if isinstance(value, (list, tuple)) else [value]
+    try:
+        return tuple(dict.fromkeys(int(p) for p in parts))
+    except (TypeError, ValueError):
+        raise InputError(f"--subdivision {value}: write one level or several, such as 3 or 1,2,3") from None
 
 
 def _require(ok: bool, name: str, value: Any, expected: str) -> None:

@@ -12,8 +12,9 @@ GUTTER = 5
 then scaled down: four texels are left, enough for two mip levels."""
 
 
-def unwrap(positions: NDArray, faces: NDArray, resolution: int) -> LatentMesh:
-    """Charts for all faces, packed into the unit square for a texture of ``resolution`` texels.
+def unwrap(positions: NDArray, faces: NDArray, resolution: int, gutter: int = GUTTER) -> LatentMesh:
+    """Charts for all faces, packed into the unit square for a texture of ``resolution`` texels, ``gutter``
+    of them empty between charts.
 
     glTF convention (v downward). Render vertices are also split where a vertex lies on charts of both
     handednesses, so that each has one tangent frame.
@@ -30,7 +31,7 @@ def unwrap(positions: NDArray, faces: NDArray, resolution: int) -> LatentMesh:
     chart.max_iterations = 2
     pack = xatlas.PackOptions()
     pack.resolution = resolution
-    pack.padding = GUTTER
+    pack.padding = gutter
     pack.bilinear = True
     atlas.generate(chart_options=chart, pack_options=pack)
     vertex, frames, uvs = atlas[0]

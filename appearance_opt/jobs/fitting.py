@@ -13,6 +13,7 @@ from appearance_opt.fit.loop import FitOptions, FitResult, fit
 from appearance_opt.fit.model import Model, Rates
 from appearance_opt.fit.validation import Validation
 from appearance_opt.initial.fill import fill
+from appearance_opt.latent.displacement import DISPLACEMENT
 from appearance_opt.reference.pool import ReferencePool
 from appearance_opt.render.gradient import Quality
 
@@ -31,6 +32,10 @@ VALIDATION_VIEWS = 8
 POOL_SAMPLES = 32
 """Rays per pixel of the reference's images where outlines pass: the coverage of the latent's pixels is exact, so
 that of the reference's should be, too."""
+
+DISPLACEMENT_RATE = 4.0
+"""Rate of the displacement map in units of that of the normal map: its texels move by a fraction of the finest
+edge, which is an eighth of the base edge at level 3."""
 
 EXPORT_SECONDS = 1.0
 """Time kept back from the budget for writing the result; the report has a reserve of its own."""
@@ -79,10 +84,11 @@ def fit_start(
     pool = ReferencePool(reference, sampler, o.pool, o.views, o.resolution, POOL_SAMPLES)
     held_out = sampler.held_out(1).draw(0, VALIDATION_VIEWS)
     validation = Validation(reference, held_out, min(o.resolution, 256))
-    model = Model(start.mesh, start.maps, frozenset(o.fit), Rates())
+    parts = frozenset(o.fit) | ({DISPLACEMENT} if o.displaced else set())
+    model = Model(start.mesh, start.maps, parts, Rates(), start.levels)
     quality, rates = effort(validation.psnr(model), start.relative)
-    given = (o.position_rate, o.normal_rate, o.color_rate, o.material_rate)
-    defaults = (rates.position, rates.normal, rates.base_color, rates.material)
+    given = (o.position_rate, o.normal_rate, o.color_rate, o.material_rate, o.displacement_rate)
+    defaults = (rates.position, rates.normal, rates.base_color, rates.material, rates.displacement)
     model.set_rates(Rates(*(d if g is None else g for g, d in zip(given, defaults, strict=True))))
     watch.lap("set-up")
     seconds = None
@@ -115,9 +121,9 @@ def effort(psnr: float, likeness: bool) -> tuple[Quality, Rates]:
     a start that knows nothing (a sphere).
     """
     if not likeness:
-        return Quality(1.0, 4, 1), Rates(0.05, 0.01, 0.02, 0.01)
+        return Quality(1.0, 4, 1), Rates(0.05, 0.01, 0.02, 0.01, 0.05)
     rate = 0.006 * float(np.clip(10 ** ((25.0 - psnr) / 30.0), 0.25, 1.0))
-    return Quality(), Rates(rate, rate, rate, rate)
+    return Quality(), Rates(rate, rate, rate, rate, DISPLACEMENT_RATE * rate)
 
 
 def clean_maps(model: Model, known: NDArray) -> dict:

@@ -41,7 +41,9 @@ def write_simplify_report(
     options: SimplifyOptions,
 ) -> None:
     """Report of a simplification: start and result against the source."""
-    metrics, per_view = _measured(source, result.start, result.asset, ("start", "result"), sampler, frame)
+    names = ("start", f"level {max(result.tessellated)}" if result.tessellated else "result")
+    metrics, per_view = _measured(source, result.start, result.shown, names, sampler, frame)
+    metrics.update(_level_metrics(source, result, sampler, frame))
     data = ReportData(
         title=f"{source.name}: {result.source_triangles:,} to {result.triangles:,} triangles",
         facts=_facts(result, options),
@@ -52,6 +54,22 @@ def write_simplify_report(
         notes=result.notes,
     )
     write_report(folder, data)
+
+
+def _level_metrics(
+    source: Asset, result: SimplifyResult, sampler: ViewSampler, frame: tuple[tuple[float, float, float], float]
+) -> dict[str, Metrics]:
+    """The coarser tessellation levels on the same views."""
+    from appearance_opt.jobs.simplify import in_frame
+
+    if len(result.tessellated) < 2:
+        return {}
+    views = sampler.held_out(HELD_OUT_STREAM).draw(0, VIEWS)
+    reference = render_asset(in_frame(source, *frame), views, RESOLUTION, SAMPLES)
+    return {
+        f"level {k}": compare_images(reference, render_asset(in_frame(a, *frame), views, RESOLUTION, SAMPLES))
+        for k, a in sorted(result.tessellated.items())[:-1]
+    }
 
 
 def write_bake_report(

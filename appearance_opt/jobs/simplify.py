@@ -30,7 +30,8 @@ CHECKPOINT_SECONDS = 10.0
 
 @dataclass
 class SimplifyResult:
-    """What ``simplify`` did. ``asset``: the result; ``start``: the same before the fit; ``fit``: curve and
+    """What ``simplify`` did. ``asset``: the result; ``start``: the same before the fit; ``tessellated``: with a
+    displacement map, the mesh as drawn at each level (and ``start`` at the finest one); ``fit``: curve and
     counts; ``seconds``: wall-clock time by stage; ``notes``: what the user should know; ``error``: set when the fit
     diverged (``simplify`` raises it after writing the best state)."""
 
@@ -42,6 +43,12 @@ class SimplifyResult:
     seconds: dict[str, float] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
     error: DivergedError | None = None
+    tessellated: dict[int, Asset] = field(default_factory=dict)
+
+    @property
+    def shown(self) -> Asset:
+        """What is to be looked at: the finest tessellated mesh, or the result itself."""
+        return self.tessellated[max(self.tessellated)] if self.tessellated else self.asset
 
 
 def simplify(
@@ -60,6 +67,7 @@ def simplify(
     every few seconds; with ``resume`` a run goes on from there. Ctrl-C ends the fit early and still
     writes the best state so far. Raises AppearanceError.
     """
+    from appearance_opt.jobs.displaced import write_companion, write_levels
     from appearance_opt.jobs.fitting import Stopwatch
 
     watch = Stopwatch()
@@ -72,6 +80,10 @@ def simplify(
     result = run.fit(progress, _checkpointer(asset, options, checkpoint, resume), report is not None)
     if out is not None:
         save(result.asset, out)
+        if options.displaced:
+            write_companion(result.asset, Path(out))
+        if options.write_tessellated:
+            write_levels(result.tessellated, Path(out))
         watch.lap("write")
     if result.error is not None:
         raise result.error
@@ -111,8 +123,8 @@ class _Job:
         self.sampler = ViewSampler(
             (0.0, 0.0, 0.0), 1.0, options.seed, hull=support(self.reference.merged.positions), light=options.light
         )
-        triangles = budget(options, asset.triangle_count)
         if options.init in ("decimate", "sphere"):
+            triangles = budget(options, asset.triangle_count)
             self.start = make_start(self.reference, options, self.sampler, triangles)
         else:
             self.start = loaded_start(
@@ -122,8 +134,9 @@ class _Job:
         watch.lap("start")
 
     def fit(self, progress: Progress | None, checkpointer, with_report: bool) -> SimplifyResult:
+        from appearance_opt.fit.model import Model, Rates
+        from appearance_opt.jobs.displaced import Exporter
         from appearance_opt.jobs.fitting import clean_maps, fit_start
-        from appearance_opt.latent.export import to_asset
 
         o = self.options
         model, fitted, error = fit_start(
@@ -138,15 +151,14 @@ class _Job:
             checkpointer=checkpointer,
             with_report=with_report,
         )
-        centre, scale = np.array(self.frame[0]), self.frame[1]
-
-        def export(positions: NDArray, maps: dict) -> Asset:
-            name = f"{self.asset.name}_{len(self.start.mesh.faces)}"
-            double_sided = any(m.material.double_sided for m in self.asset.meshes)
-            return to_asset(self.start.mesh, positions.astype(np.float64) * scale + centre, maps, name, double_sided)
-
-        begin = export(self.start.mesh.positions, self.start.maps)
-        result = export(model.host_positions(), clean_maps(model, self.start.known))
+        name = f"{self.asset.name}_{len(self.start.mesh.faces)}"
+        double_sided = any(m.material.double_sided for m in self.asset.meshes)
+        exporter = Exporter(np.array(self.frame[0]), self.frame[1], name, double_sided)
+        initial = Model(self.start.mesh, self.start.maps, frozenset(), Rates(), self.start.levels[-1:])
+        begin = exporter.drawn(initial, self.start.maps)[initial.level]
+        maps = clean_maps(model, self.start.known)
+        result = exporter.base(model, maps)
+        tessellated = exporter.drawn(model, maps) if o.displaced else {}
         self.watch.lap("export")
         notes = list(self.asset.notes)
         if fitted.skipped:
@@ -154,7 +166,14 @@ class _Job:
         if fitted.interrupted:
             notes.append(f"interrupted after {fitted.steps} steps: this is the best state so far")
         return SimplifyResult(
-            result, begin, fitted, len(self.start.mesh.faces), self.asset.triangle_count, notes=notes, error=error
+            result,
+            begin,
+            fitted,
+            len(self.start.mesh.faces),
+            self.asset.triangle_count,
+            notes=notes,
+            error=error,
+            tessellated=tessellated,
         )
 
 

@@ -16,6 +16,8 @@ from appearance_opt.initial.reallocate import StartError, weights
 from appearance_opt.initial.sphere import random_maps, sphere
 from appearance_opt.initial.transfer import transfer
 from appearance_opt.initial.visibility import importance, pixel_counts
+from appearance_opt.jobs.displaced import displaced, flat_map, gutter, require_memory
+from appearance_opt.latent.displacement import DISPLACEMENT
 from appearance_opt.latent.latent import LatentMesh
 
 if TYPE_CHECKING:
@@ -35,22 +37,32 @@ VISIBILITY_VIEWS = 160
 @dataclass(frozen=True)
 class Start:
     """``maps``: channel name -> image or number; ``relative``: may the Laplacian keep this shape?
-    ``known``: texels whose values mean something."""
+    ``known``: texels whose values mean something. ``levels``: tessellation levels at which it is drawn;
+    ``finest``: the displaced mesh of the finest one, None without displacement."""
 
     mesh: LatentMesh
     maps: dict[str, NDArray | float]
     relative: bool
     known: NDArray[np.bool_]
+    levels: tuple[int, ...] = (0,)
+    finest: LatentMesh | None = None
+
+    @property
+    def drawn(self) -> LatentMesh:
+        """The mesh that is seen."""
+        return self.mesh if self.finest is None else self.finest
 
 
 def budget(options: SimplifyOptions, available: int) -> int:
-    """Triangles asked for. Raises InputError when the input has fewer."""
+    """Triangles asked for. Raises InputError when the input has fewer, or when their tessellation does not fit
+    into memory."""
     count = options.triangles
     if count is None:
         assert options.ratio is not None
         count = max(4, round(options.ratio * available))
     if count > available:
         raise InputError(f"--triangles {count}: the input has only {available} triangles; ask for fewer")
+    require_memory(count, options)
     return count
 
 
@@ -59,8 +71,11 @@ def make_start(reference: MeshReference, options: SimplifyOptions, sampler: View
     size = options.texture_size
     if options.init == "sphere":
         mesh = sphere(triangles, sampler.centre, 0.6 * sampler.radius, size)
-        maps = random_maps(size, options.seed, "normal" in options.fit)
-        return Start(mesh, {**maps}, False, np.zeros((size, size), bool))
+        maps = random_maps(size, options.seed, options.normal_map and "normal" in options.fit)
+        known = np.zeros((size, size), bool)
+        if options.displaced:
+            return Start(mesh, {**maps, DISPLACEMENT: flat_map(mesh, options)}, False, known, options.levels())
+        return Start(mesh, {**maps}, False, known)
     merged = reference.merged
     faces = merged.faces
     visible = np.ones(len(faces), bool)
@@ -74,7 +89,7 @@ def make_start(reference: MeshReference, options: SimplifyOptions, sampler: View
         positions, low = decimate(merged.positions, faces[visible], triangles, weight[visible])
         if not len(low):
             raise InputError("nothing is left of this mesh at that budget; ask for more triangles")
-        return transferred(reference, unwrap(positions, low, size), size)
+        return transferred(reference, unwrap(positions, low, size, gutter(len(low), options)), options)
 
     start = decimated(weight)
     if not options.reallocate:
@@ -93,24 +108,29 @@ def _reallocated(
 ) -> Start:
     """The best of a start and those with triangles moved to where its image error is."""
     judge = StartError(reference, sampler)
-    best, (error, by_face) = start, judge.measure(start.mesh, start.maps)
+    best, (error, by_face) = start, judge.measure(start.drawn, start.maps)
     for number in range(1, rounds + 1):
         weight = weight * weights(reference.merged.positions, reference.merged.faces, by_face, visible)
         candidate = decimated(weight)
-        again, by_face = judge.measure(candidate.mesh, candidate.maps)
+        again, by_face = judge.measure(candidate.drawn, candidate.maps)
         log.info("triangles moved, round %d: squared error of the start %.3g -> %.3g", number, error, again)
         if again < error:
             best, error = candidate, again
     return best
 
 
-def transferred(reference: MeshReference, mesh: LatentMesh, size: int) -> Start:
+def transferred(reference: MeshReference, mesh: LatentMesh, options: SimplifyOptions) -> Start:
     """A mesh with the reference's appearance in its maps."""
-    result = transfer(reference, mesh, size)
+    finest = None
+    displacement: dict[str, NDArray] = {}
+    if options.displaced:
+        finest, displacement = displaced(reference, mesh, options)
+    result = transfer(reference, mesh if finest is None else finest, options.texture_size)
     missed = result.missed.sum() / max(result.covered.sum(), 1)
     if missed > 0.01:
         log.warning("the transfer found no reference point for %.1f %% of the texels; they were filled", 100 * missed)
-    return Start(mesh, {**result.maps}, True, result.covered)
+    maps = {n: v for n, v in result.maps.items() if options.normal_map or not n.startswith("normal")}
+    return Start(mesh, {**maps, **displacement}, True, result.covered, options.levels(), finest)
 
 
 def loaded_start(
@@ -126,5 +146,7 @@ def loaded_start(
     f = np.concatenate([m.faces + o for m, o in zip(asset.meshes, offsets, strict=True)])
     first, place = weld(p)
     centre, scale = to_fit_frame
-    mesh = unwrap((p[first] - centre) / scale, place[f].astype(np.int32), options.texture_size)
-    return transferred(reference, mesh, options.texture_size)
+    faces = place[f].astype(np.int32)
+    require_memory(len(faces), options)
+    mesh = unwrap((p[first] - centre) / scale, faces, options.texture_size, gutter(len(faces), options))
+    return transferred(reference, mesh, options)

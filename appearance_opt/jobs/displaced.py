@@ -1,0 +1,135 @@
+"""What jobs with a displacement map share: its size, its closed-form start, memory, and what is written."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from appearance_opt import backend
+from appearance_opt.asset import save
+from appearance_opt.asset.height import displacement_of, height_png
+from appearance_opt.asset.paths import replacing
+from appearance_opt.bake.closed_form import Settings, bake
+from appearance_opt.errors import InputError
+from appearance_opt.initial.atlas import GUTTER
+from appearance_opt.latent.displacement import DISPLACEMENT, Tessellator, footprint
+from appearance_opt.latent.export import to_asset
+from appearance_opt.latent.subdivision import tessellate
+from appearance_opt.latent.texels import TexelCodec
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from appearance_opt.asset.types import Asset
+    from appearance_opt.config import CommonOptions
+    from appearance_opt.fit.model import Model
+    from appearance_opt.latent.latent import LatentMesh
+    from appearance_opt.reference.mesh import MeshReference
+
+FILLED = 0.6
+"""Share of an atlas that its charts cover, about."""
+
+MAX_GUTTER = 16
+
+BYTES_PER_TRIANGLE = 900
+"""Peak memory of a fit for each tessellated triangle, all levels together (docs/displacement.md)."""
+
+BYTES_AT_LEAST = 1 << 29
+"""What a job takes apart from that: libraries, kernels, maps, images."""
+
+
+def require_memory(triangles: int, options: CommonOptions) -> None:
+    """Raise InputError with the numbers if tessellating ``triangles`` would exceed the memory that is free."""
+    free = backend.available_memory()
+    if not options.displaced or free is None:
+        return
+    counts = {level: triangles * 4**level for level in options.levels()}
+    need = BYTES_AT_LEAST + BYTES_PER_TRIANGLE * sum(counts.values())
+    if need > free:
+        finest = max(counts)
+        raise InputError(
+            f"--subdivision {finest}: {triangles} triangles become {counts[finest]}, which takes about "
+            f"{need / 2**30:.1f} GiB, and {free / 2**30:.1f} GiB are free; choose a lower level or fewer --triangles"
+        )
+
+
+def gutter(triangles: int, options: CommonOptions) -> int:
+    """Texels between the charts of a new atlas: two edges of the finest tessellation, for a vertex on the rim of
+    a chart reads its displacement from texels of about an edge's length on both sides."""
+    if not options.displaced:
+        return GUTTER
+    area = FILLED * options.texture_size**2 / (triangles * 4 ** max(options.levels()))
+    return int(np.clip(np.ceil(2 * np.sqrt(area * 4 / 3**0.5)), GUTTER, MAX_GUTTER))
+
+
+def map_size(mesh: LatentMesh, options: CommonOptions) -> int:
+    """Texels per side of the displacement map: the power of two at which a texel is just not longer than an edge
+    of the finest tessellation. More could not be told apart by the mesh, and would be fitted by nothing."""
+    edge = float(np.sqrt(np.median(footprint(tessellate(mesh, max(options.levels())).mesh))))
+    return int(np.clip(2 ** np.ceil(np.log2(1 / max(edge, 1e-6))), 16, options.texture_size))
+
+
+def flat_map(mesh: LatentMesh, options: CommonOptions) -> NDArray[np.float32]:
+    """No displacement."""
+    size = map_size(mesh, options)
+    return np.zeros((size, size), np.float32)
+
+
+def displaced(
+    reference: MeshReference, mesh: LatentMesh, options: CommonOptions
+) -> tuple[LatentMesh, dict[str, NDArray[np.float32]]]:
+    """Closed form: the displacement map that rays along the interpolated normals find, and the mesh that it makes
+    at the finest level, to whose frames the other maps belong."""
+    size = map_size(mesh, options)
+    found = bake(reference, mesh, Settings(size, (DISPLACEMENT,), samples=4)).maps[DISPLACEMENT]
+    with dr.suspend_grad():
+        tessellator = Tessellator(mesh, max(options.levels()), tangents=False)
+        codec = TexelCodec((DISPLACEMENT,), size)
+        layer = codec.layer(codec.encode({DISPLACEMENT: found}))
+        flat = mi.Float(np.ascontiguousarray(mesh.positions, np.float32).ravel())
+        positions = np.array(tessellator(flat, layer)).reshape(-1, 3)
+    return replace(tessellator.topology.mesh, positions=positions), {DISPLACEMENT: found}
+
+
+class Exporter:
+    """Assets of a displaced model, in the place and scale of the input."""
+
+    def __init__(self, centre: NDArray, scale: float, name: str, double_sided: bool) -> None:
+        self.centre, self.scale, self.name, self.double_sided = centre, scale, name, double_sided
+
+    def base(self, model: Model, maps: dict) -> Asset:
+        """The base mesh, its maps, and the displacement map in metres."""
+        asset = self._asset(model.mesh, model.host_positions(), maps, self.name)
+        heights = model.host_displacement()
+        if heights is None:
+            return asset
+        mesh = asset.meshes[0]
+        material = replace(mesh.material, displacement=displacement_of(heights * np.float32(self.scale)))
+        return replace(asset, meshes=(replace(mesh, material=material),))
+
+    def drawn(self, model: Model, maps: dict) -> dict[int, Asset]:
+        """The mesh as it is drawn at each tessellation level."""
+        return {k: self._asset(*model.host_drawn(k), maps, f"{self.name}_level{k}") for k in model.levels}
+
+    def _asset(self, mesh: LatentMesh, positions: NDArray, maps: dict, name: str) -> Asset:
+        placed = positions.astype(np.float64) * self.scale + self.centre
+        return to_asset(mesh, placed, maps, name, self.double_sided)
+
+
+def write_levels(tessellated: dict[int, Asset], out: Path) -> None:
+    """The tessellated meshes beside ``out``: ``<stem>_level<k><suffix>``."""
+    for level, asset in tessellated.items():
+        save(asset, out.with_name(f"{out.stem}_level{level}{out.suffix}"))
+
+
+def write_companion(asset: Asset, out: Path) -> None:
+    """The displacement map as ``<stem>_displacement.png`` for a format that has no place for its name."""
+    displacement = asset.meshes[0].material.displacement
+    if displacement is not None and out.suffix.lower() == ".obj":
+        with replacing(out.with_name(f"{out.stem}_displacement.png")) as temporary:
+            temporary.write_bytes(height_png(displacement))
