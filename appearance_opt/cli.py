@@ -130,13 +130,7 @@ def simplify(
     folder = None if no_report else report or out.with_name(out.stem + ".report")
     with TerminalProgress() as progress:
         result = run(asset, out, options, report=folder, checkpoint=checkpoint, resume=resume, progress=progress)
-    for note in result.notes:
-        print(f"note: {note}", file=sys.stderr)
-    curve = result.fit.curve
-    quality = f", held-out PSNR {curve[0].psnr:.2f} -> {max(p.psnr for p in curve):.2f} dB" if curve else ""
-    print(f"{out}: {result.triangles} of {result.source_triangles} triangles, {result.seconds['total']:.1f} s{quality}")
-    if folder is not None:
-        print(f"report: {folder / 'report.html'}")
+    _print_result(out, result, folder)
 
 
 @app.command()
@@ -177,6 +171,11 @@ def bake(
     refine: Annotated[int | None, typer.Option(help="Level to which USD subdivision surfaces are refined.")] = None,
     variant: Annotated[list[str] | None, typer.Option(help="USD variant of HIGH: set=name (repeatable).")] = None,
     device: Annotated[str | None, typer.Option(help="auto, cpu or cuda.")] = None,
+    joint: Annotated[bool | None, typer.Option("--joint", help="Fit LOW's shape and a displacement, too.")] = None,
+    subdivision: Annotated[str | None, typer.Option(help="Tessellation with --joint: 3, or 1,2,3.")] = None,
+    position_rate: Annotated[float | None, typer.Option(help="With --joint: as for simplify.")] = None,
+    displacement_rate: Annotated[float | None, typer.Option(help="With --joint: as for simplify.")] = None,
+    write_tessellated: Annotated[bool | None, typer.Option("--write-tessellated", help="With --joint.")] = None,
     textures: Annotated[Path | None, typer.Option(help="Folder for the maps as loose files.")] = None,
     report: Annotated[Path | None, typer.Option(help="Folder for the report [OUT's name + .report].")] = None,
     no_report: Annotated[bool, typer.Option("--no-report", help="Write no report.")] = False,
@@ -200,6 +199,12 @@ def bake(
         check_paths(source, out)
     heavy = load(high, refine=options.refine, variants=_variants(variant))
     folder = None if no_report else report or out.with_name(out.stem + ".report")
+    if options.joint:
+        from appearance_opt.jobs.joint import joint as run_joint
+
+        with TerminalProgress() as progress:
+            _print_result(out, run_joint(heavy, low, out, options, report=folder, progress=progress), folder)
+        return
     with TerminalProgress() as progress:
         result = run(heavy, low, out, options, report=folder, textures=textures, progress=progress)
     for note in result.notes:
@@ -284,6 +289,17 @@ def doctor(as_json: Annotated[bool, typer.Option("--json", help="Print as JSON."
             print(f"{name:16} {value}")
     if found["problem"]:
         raise AppearanceError(str(found["problem"]))
+
+
+def _print_result(out: Path, result: Any, folder: Path | None) -> None:
+    """What a job that fits shape and maps has done."""
+    for note in result.notes:
+        print(f"note: {note}", file=sys.stderr)
+    curve = result.fit.curve
+    quality = f", held-out PSNR {curve[0].psnr:.2f} -> {max(p.psnr for p in curve):.2f} dB" if curve else ""
+    print(f"{out}: {result.triangles} of {result.source_triangles} triangles, {result.seconds['total']:.1f} s{quality}")
+    if folder is not None:
+        print(f"report: {folder / 'report.html'}")
 
 
 def _variants(given: list[str] | None) -> dict[str, str] | None:

@@ -199,7 +199,8 @@ class BakeOptions(CommonOptions):
         for name in self.maps:
             _choice("maps", name, MAPS)
         for part in self.fit:
-            _require(part in ("normal", "material"), "fit", part, "of normal,material: LOW keeps its shape")
+            shape = part == "shape" and self.joint
+            _require(shape or part in ("normal", "material"), "fit", part, "of normal,material: LOW keeps its shape")
         _require(1 <= self.samples <= 64, "samples", self.samples, "from 1 to 64")
         _require(self.cage is None or self.cage > 0, "cage", self.cage, "a positive distance in metres")
         _choice("hit", self.hit, HITS)

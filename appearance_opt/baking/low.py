@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from appearance_opt.asset.normals import vertex_normals
+from appearance_opt.asset.normals import vertex_normals, weld
 from appearance_opt.asset.tangents import split_and_tangents
 from appearance_opt.asset.types import Asset, Material
 from appearance_opt.latent.latent import LatentMesh
@@ -56,6 +56,19 @@ def prepare(asset: Asset) -> Low:
 def moved(mesh: LatentMesh, centre: NDArray, scale: float) -> LatentMesh:
     """The mesh moved by -centre and divided by scale."""
     return replace(mesh, positions=((mesh.positions.astype(np.float64) - centre) / scale).astype(np.float32))
+
+
+def movable(mesh: LatentMesh) -> LatentMesh:
+    """The mesh with its vertices joined wherever they lie at the same place, so that its shape can be fitted and
+    no seam opens. Faces and texture coordinates stay; normals follow from the shape from now on."""
+    first, place = weld(mesh.positions)
+    return LatentMesh(
+        positions=mesh.positions[first],
+        faces=place[mesh.faces].astype(np.int32),
+        frame_vertex=place[mesh.frame_vertex].astype(np.int32),
+        frame_faces=mesh.frame_faces,
+        uvs=mesh.uvs,
+    )
 
 
 def unwrapped(asset: Asset, size: int) -> Asset:

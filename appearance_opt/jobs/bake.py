@@ -78,7 +78,7 @@ def bake(
     heavy = load(high, refine=options.refine) if isinstance(high, (str, Path)) else high
     light = load(low, refine=options.refine) if isinstance(low, (str, Path)) else low
     watch.lap("load")
-    run = _Job(heavy, light, str(low) if isinstance(low, (str, Path)) else light.name, options, watch)
+    run = BakeJob(heavy, light, str(low) if isinstance(low, (str, Path)) else light.name, options, watch)
     result, error = run.run(progress, report is not None)
     if out is not None:
         save(result.asset, out)
@@ -96,7 +96,7 @@ def bake(
     return result
 
 
-class _Job:
+class BakeJob:
     """Both assets in one frame; then the closed form, then the fit."""
 
     def __init__(self, high: Asset, low: Asset, name: str, options: BakeOptions, watch: Stopwatch) -> None:

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from appearance_opt.asset.types import Asset
-    from appearance_opt.config import BakeOptions, CommonOptions, SimplifyOptions
+    from appearance_opt.config import BakeOptions, CommonOptions
     from appearance_opt.evaluate.metrics import Metrics
     from appearance_opt.jobs.bake import BakeResult
     from appearance_opt.jobs.simplify import SimplifyResult
@@ -38,7 +38,7 @@ def write_simplify_report(
     result: SimplifyResult,
     sampler: ViewSampler,
     frame: tuple[tuple[float, float, float], float],
-    options: SimplifyOptions,
+    options: CommonOptions,
 ) -> None:
     """Report of a simplification: start and result against the source."""
     names = ("start", f"level {max(result.tessellated)}" if result.tessellated else "result")
@@ -173,7 +173,7 @@ def triangle_images(asset: Asset, views: Views, resolution: int) -> NDArray[np.i
     return np.stack(out)
 
 
-def _facts(result: SimplifyResult, options: SimplifyOptions) -> dict[str, object]:
+def _facts(result: SimplifyResult, options: CommonOptions) -> dict[str, object]:
     fit = result.fit
     facts: dict[str, object] = {
         "triangles": f"{result.triangles} of {result.source_triangles}",

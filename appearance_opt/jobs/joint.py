@@ -1,0 +1,107 @@
+"""Bake with the shape free: LOW's vertices, a displacement map, normals and material fitted together."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from appearance_opt.asset import load, save
+from appearance_opt.jobs.simplify import SimplifyResult, check_paths
+
+if TYPE_CHECKING:
+    from appearance_opt.asset.types import Asset
+    from appearance_opt.config import BakeOptions
+    from appearance_opt.fit.loop import Progress
+
+LAPLACIAN = 0.25
+"""Weight of the Laplacian, as by default in a simplification."""
+
+
+def joint(
+    high: str | Path | Asset,
+    low: str | Path | Asset,
+    out: str | Path | None,
+    options: BakeOptions,
+    *,
+    report: str | Path | None = None,
+    progress: Progress | None = None,
+) -> SimplifyResult:
+    """Fit base shape, displacement, normals and material of ``low`` to ``high`` and write the result to ``out``
+    (None: do not write). LOW keeps its topology and its texture coordinates; each kind of detail goes where it
+    is represented best. Raises AppearanceError."""
+    from appearance_opt.jobs.bake import BakeJob
+    from appearance_opt.jobs.displaced import require_memory, write_companion, write_levels
+    from appearance_opt.jobs.fitting import Stopwatch
+
+    watch = Stopwatch()
+    if out is not None:
+        for source in (high, low):
+            check_paths(Path(source) if isinstance(source, (str, Path)) else None, Path(out))
+    heavy = load(high, refine=options.refine) if isinstance(high, (str, Path)) else high
+    light = load(low, refine=options.refine) if isinstance(low, (str, Path)) else low
+    require_memory(light.triangle_count, options)
+    watch.lap("load")
+    job = BakeJob(heavy, light, str(low) if isinstance(low, (str, Path)) else light.name, options, watch)
+    result = _fitted(job, light, options, progress, report is not None)
+    if out is not None:
+        save(result.asset, out)
+        write_companion(result.asset, Path(out))
+        if options.write_tessellated:
+            write_levels(result.tessellated, Path(out))
+        watch.lap("write")
+    if result.error is not None:
+        raise result.error
+    if report is not None:
+        from appearance_opt.jobs.report import write_simplify_report
+
+        result.seconds = dict(watch.stages)
+        write_simplify_report(Path(report), job.high, result, job.sampler, job.frame, options)
+        watch.lap("report")
+    result.seconds = {**watch.stages, "total": watch.total}
+    return result
+
+
+def _fitted(job, light: Asset, options: BakeOptions, progress: Progress | None, with_report: bool) -> SimplifyResult:
+    from appearance_opt.bake.closed_form import Settings, bake
+    from appearance_opt.bake.low import movable
+    from appearance_opt.fit.model import Model, Rates
+    from appearance_opt.jobs.displaced import Exporter, displaced
+    from appearance_opt.jobs.fitting import clean_maps, fit_start
+    from appearance_opt.jobs.start import Start
+
+    mesh = movable(job.mesh)
+    drawn, displacement = displaced(job.reference, mesh, options)
+    found = bake(job.reference, drawn, Settings(options.texture_size, samples=options.samples))
+    maps = {n: v for n, v in found.maps.items() if options.wants("normal") or not n.startswith("normal")}
+    start = Start(mesh, {**maps, **displacement}, True, found.covered, options.levels())
+    job.watch.lap("closed form")
+    parts = tuple(dict.fromkeys(("shape", *options.fit)))
+    model, fitted, error = fit_start(
+        job.reference,
+        job.sampler,
+        start,
+        replace(options, fit=parts),
+        job.watch,
+        laplacian=LAPLACIAN,
+        progress=progress,
+        with_report=with_report,
+    )
+    double_sided = any(m.material.double_sided for m in light.meshes)
+    exporter = Exporter(np.array(job.frame[0]), job.frame[1], light.name, double_sided)
+    initial = Model(mesh, start.maps, frozenset(), Rates(), start.levels[-1:])
+    final = clean_maps(model, start.known)
+    result = SimplifyResult(
+        exporter.base(model, final),
+        exporter.drawn(initial, start.maps)[initial.level],
+        fitted,
+        len(mesh.faces),
+        job.high.triangle_count,
+        notes=list(job.notes),
+        error=error,
+        tessellated=exporter.drawn(model, final),
+    )
+    job.watch.lap("export")
+    return result

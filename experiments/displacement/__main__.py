@@ -1,0 +1,138 @@
+"""Division of labour: what do a normal map, a displacement map, and both add to 1,000 triangles?
+
+    python -m experiments.displacement [--assets chess_king,flight_helmet,relic] [--budget 60] [--triangles 1000]
+    python -m experiments.displacement --growth
+
+Per asset, at level 3: the base mesh with a normal map; displacement alone; both; and a mesh of 16 times the base
+triangles with a normal map, simplified directly. All are judged as they are drawn, on held-out views. ``--growth``:
+time per step and peak memory for levels 0 to 4 of 1,000 triangles. Results are appended to
+``out/displacement/results.json`` row by row; a row that is there with the same settings is not run again.
+Needs ``../shared/judge/references`` for the first two assets.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+REFERENCES = ROOT.parent / "shared" / "judge" / "references"
+OUT = ROOT / "out" / "displacement"
+LEVEL, FACTOR = 3, 16
+KINDS: dict[str, dict] = {
+    "normal map alone": {},
+    "displacement alone": {"displacement": True, "subdivision": (LEVEL,), "normal_map": False},
+    "both": {"displacement": True, "subdivision": (LEVEL,)},
+    f"{FACTOR} x the triangles": {"factor": FACTOR},
+}
+SIMPLIFY = """
+import json, sys, appearance_opt as a
+from appearance_opt.jobs.compare import compare
+source, out, values = sys.argv[1], sys.argv[2], json.loads(sys.argv[3])
+r = a.simplify(source, out, a.simplify_options("default", **values))
+m = {n: compare(source, x, views=16).metrics for n, x in (("start", r.start), ("result", r.shown))}
+names = ("psnr_covered", "flip", "silhouette_shift", "silhouette_iou")
+print(json.dumps({"seconds": r.seconds, "steps": r.fit.steps, "drawn": r.shown.triangle_count,
+                  **{k: {n: getattr(v, n) for n in names} for k, v in m.items()}}))
+"""
+GROWTH = """
+import json, resource, sys, time, appearance_opt as a
+level, values = int(sys.argv[2]), json.loads(sys.argv[3])
+times = []
+class Watch:
+    def update(self, *_):
+        times.append(time.perf_counter())
+r = a.simplify(sys.argv[1], None, a.simplify_options("default", **values, displacement=True, subdivision=level),
+               progress=Watch())
+gaps = sorted(b - t for t, b in zip(times[5:], times[6:]))
+print(json.dumps({"drawn": r.shown.triangle_count, "ms": 1000 * gaps[len(gaps) // 2],
+                  "peak_gib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20}))
+"""
+
+
+def source_of(asset: str) -> Path:
+    """The file of an asset; the relic is built when it is not there."""
+    if asset != "relic":
+        return REFERENCES / f"{asset}.glb"
+    path = OUT / "relic.glb"
+    if not path.exists():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        subprocess.run([sys.executable, "-m", "scenes.build", "relic", str(path)], check=True, cwd=ROOT)
+    return path
+
+
+def run(code: str, *arguments: str) -> dict:
+    """Run a snippet in a fresh process; its last line is JSON."""
+    command = [sys.executable, "-c", code, *arguments]
+    done = subprocess.run(command, check=True, capture_output=True, text=True, cwd=ROOT)
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def labour(asset: str, kind: str, triangles: int, common: dict) -> dict:
+    """One row."""
+    values = {**KINDS[kind], **common}
+    values["triangles"] = triangles * values.pop("factor", 1)
+    out = OUT / f"{asset}_{kind.replace(' ', '_')}.glb"
+    return run(SIMPLIFY, str(source_of(asset)), str(out), json.dumps(values))
+
+
+def table(rows: list[dict]) -> str:
+    """Markdown: one line per asset and kind."""
+    lines = [
+        "| asset | kind | triangles drawn | start: PSNR / FLIP / shift | result: PSNR / FLIP / shift | s, steps |",
+        "|---|---|---|---|---|---|",
+    ]
+    for r in rows:
+        cells = [
+            f"{s['psnr_covered']:.2f} / {s['flip']:.4f} / {s['silhouette_shift']:.3f}"
+            for s in (r["start"], r["result"])
+        ]
+        lines.append(
+            f"| {r['asset']} | {r['kind']} | {r['drawn']} | {cells[0]} | {cells[1]} | "
+            f"{r['seconds']['total']:.0f}, {r['steps']} |"
+        )
+    return "\n".join(lines)
+
+
+def growth(asset: str, triangles: int) -> None:
+    """Time per step and memory by level."""
+    print("| level | triangles drawn | ms per step (4 x 256^2) | peak GiB |\n|---|---|---|---|")
+    for level in range(5):
+        values = json.dumps({"triangles": triangles, "steps": 40, "pool": 16})
+        r = run(GROWTH, str(source_of(asset)), str(level), values)
+        print(f"| {level} | {r['drawn']} | {r['ms']:.0f} | {r['peak_gib']:.2f} |", flush=True)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--assets", default="chess_king,flight_helmet,relic")
+    parser.add_argument("--kinds", default=",".join(KINDS))
+    parser.add_argument("--triangles", type=int, default=1000)
+    parser.add_argument("--budget", type=float, default=60.0)
+    parser.add_argument("--steps", type=int)
+    parser.add_argument("--growth", action="store_true")
+    parser.add_argument("--table", action="store_true")
+    a = parser.parse_args()
+    if a.growth:
+        growth(a.assets.split(",")[0], a.triangles)
+        return
+    OUT.mkdir(parents=True, exist_ok=True)
+    path = OUT / "results.json"
+    rows = json.loads(path.read_text()) if path.exists() else []
+    common = {"budget": a.budget} if a.steps is None else {"steps": a.steps}
+    for asset in a.assets.split(",") if not a.table else ():
+        for kind in a.kinds.split(","):
+            key = {"asset": asset, "kind": kind, "base": a.triangles, "common": common}
+            if any(all(r[k] == v for k, v in key.items()) for r in rows):
+                continue
+            rows.append({**key, **labour(asset, kind, a.triangles, common)})
+            path.write_text(json.dumps(rows, indent=1))
+            print(table(rows[-1:]).splitlines()[2], flush=True)
+    print(table(rows))
+
+
+if __name__ == "__main__":
+    main()

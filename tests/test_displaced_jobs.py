@@ -1,0 +1,195 @@
+"""Jobs with a displacement map: options, memory, files, several levels, the joint bake."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from appearance_opt import backend
+from appearance_opt.asset import load, save
+from appearance_opt.asset.height import heights_of
+from appearance_opt.asset.types import Asset, Displacement, Texture
+from appearance_opt.asset.validate import validate
+from appearance_opt.bake.low import movable, prepare
+from appearance_opt.config import bake_options, simplify_options
+from appearance_opt.errors import InputError
+from appearance_opt.fit.loop import level_of
+from appearance_opt.fit.model import POSITIONS, TEXELS, Model, Rates
+from appearance_opt.jobs.displaced import map_size
+from appearance_opt.jobs.joint import joint
+from appearance_opt.jobs.simplify import simplify
+from appearance_opt.latent.displacement import DISPLACEMENT, Tessellator, footprint
+from appearance_opt.latent.subdivision import tessellate
+from appearance_opt.latent.texels import TexelCodec
+from scenes.analytic import bumpy_sphere
+
+QUICK = {"texture_size": 128, "resolution": 48, "pool": 8, "views": 2, "steps": 3}
+
+
+def options(**values: object):
+    return simplify_options(**{"triangles": 200, "displacement": True, **QUICK, **values})
+
+
+@pytest.fixture(scope="module")
+def bumpy() -> Asset:
+    return bumpy_sphere(20_000)
+
+
+def test_levels_are_read_in_every_way_and_checked() -> None:
+    assert options().levels() == (3,)
+    assert options(subdivision="3,1,2,1").levels() == (1, 2, 3)
+    assert options(subdivision=0).levels() == (0,)
+    assert simplify_options(triangles=9).levels() == (0,)
+    with pytest.raises(InputError, match="--subdivision 5: must be from 0 to 4"):
+        options(subdivision="2,5")
+    with pytest.raises(InputError, match="one level or several"):
+        options(subdivision="fine")
+    with pytest.raises(InputError, match="together with --displacement"):
+        simplify_options(triangles=9, subdivision=2)
+    with pytest.raises(InputError, match="together with --joint"):
+        bake_options(subdivision=2)
+    with pytest.raises(InputError, match="LOW keeps its shape"):
+        bake_options(fit="shape")
+
+
+def test_the_level_of_an_iteration_can_be_replayed() -> None:
+    drawn = [level_of((1, 2, 3), 5, k) for k in range(300)]
+    assert drawn == [level_of((1, 2, 3), 5, k) for k in range(300)]
+    assert min(np.bincount(drawn)[1:]) > 70  # each in about a third of the steps
+    assert {level_of((2,), 5, k) for k in range(9)} == {2}
+
+
+def test_too_much_is_refused_with_the_number(bumpy: Asset, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(backend, "available_memory", lambda: 3 << 30)
+    message = r"5000 triangles become 1280000, which takes about \d\.\d GiB, and 3\.0 GiB are free"
+    with pytest.raises(InputError, match=message) as error:
+        simplify(bumpy, None, options(triangles=5000, subdivision=4))
+    assert "\n" not in str(error.value)
+
+
+def test_free_memory_is_known() -> None:
+    free = backend.available_memory()
+    assert free is not None and 2**20 < free < 2**50
+
+
+def test_the_map_is_as_fine_as_the_mesh() -> None:
+    mesh = movable(prepare(load_ball()).mesh)
+    size = map_size(mesh, options(texture_size=1024))
+    texels = size * np.sqrt(np.median(footprint(tessellate(mesh, 3).mesh)))
+    assert 1 <= texels < 2  # texels per edge of the finest mesh
+    assert map_size(mesh, options(texture_size=32)) == 32
+
+
+def load_ball() -> Asset:
+    return simplify(bumpy_sphere(5_000), None, options(steps=0)).asset
+
+
+def test_files_of_a_displaced_result(bumpy: Asset, tmp_path: Path) -> None:
+    out = tmp_path / "low.glb"
+    o = options(subdivision="1,2", write_tessellated=True)
+    result = simplify(bumpy, out, o, report=tmp_path / "report")
+    assert {p.name for p in tmp_path.iterdir()} == {
+        "low.glb",
+        "low_displacement.png",
+        "low_level1.glb",
+        "low_level2.glb",
+        "report",
+    }
+    base, levels = load(out), {k: load(tmp_path / f"low_level{k}.glb") for k in (1, 2)}
+    assert base.triangle_count == result.triangles <= 200
+    for level, asset in levels.items():
+        assert asset.triangle_count == base.triangle_count * 4**level
+        assert validate(asset).boundary_edges == 0  # closed although its charts are split
+    metrics = json.loads((tmp_path / "report" / "report.json").read_text())["metrics"]
+    assert set(metrics) == {"start", "level 1", "level 2"}
+
+    # who has the base mesh and the 16-bit map alone gets the same mesh
+    given = result.asset.meshes[0].material.displacement
+    assert given is not None
+    pixels = _png(tmp_path / "low_displacement.png")
+    heights = heights_of(Displacement(Texture(pixels, "linear"), given.scale, given.mid))
+    mesh = movable(prepare(base).mesh)
+    codec = TexelCodec((DISPLACEMENT,), len(heights))
+    layer = codec.layer(codec.encode({DISPLACEMENT: heights}))
+    again = np.array(Tessellator(mesh, 2, False)(mi.Float(mesh.positions.ravel()), layer)).reshape(-1, 3)
+    theirs = levels[2].meshes[0].positions
+    distance = np.array([np.linalg.norm(theirs - p, axis=1).min() for p in again])
+    # rounding of 16 bits: half of scale / 65535; measured 0.6 of it in the mean of a lookup
+    assert distance.max() < given.scale / 65535 + 1e-6
+    assert np.abs(heights).max() > 100 * given.scale / 65535
+
+
+def _png(path: Path) -> np.ndarray:
+    from appearance_opt.asset.images import read
+
+    pixels = read(path)
+    assert pixels.dtype == np.uint16
+    return pixels
+
+
+def test_displacement_in_usd_and_obj(bumpy: Asset, tmp_path: Path) -> None:
+    from pxr import Usd, UsdShade
+
+    result = simplify(bumpy, tmp_path / "low.usda", options(steps=0))
+    stage = Usd.Stage.Open(str(tmp_path / "low.usda"))
+    materials = [UsdShade.Material(p) for p in stage.Traverse() if p.IsA(UsdShade.Material)]
+    assert materials[0].GetDisplacementOutput().HasConnectedSource()
+    save(result.asset, tmp_path / "again.usda")
+    simplify(bumpy, tmp_path / "low.obj", options(steps=0))
+    assert _png(tmp_path / "low_displacement.png").shape[2] == 1
+
+
+def test_what_is_not_there_has_no_parameter(bumpy: Asset) -> None:
+    result = simplify(bumpy, None, options(steps=0, normal_map=False))
+    assert result.asset.meshes[0].material.normal_texture is None
+    assert result.asset.meshes[0].material.displacement is not None
+    plain = simplify(bumpy, None, simplify_options(triangles=200, **{**QUICK, "steps": 0}))
+    assert plain.asset.meshes[0].material.displacement is None and not plain.tessellated
+    mesh = movable(prepare(result.asset).mesh)
+    flat = np.zeros((16, 16), np.float32)
+    maps = {"red": flat, "displacement": flat}
+    assert set(Model(mesh, maps, frozenset({"displacement"}), Rates(), (1,)).parameters) == {DISPLACEMENT}
+    assert set(Model(mesh, maps, frozenset({"shape", "material"}), Rates(), (1,)).parameters) == {POSITIONS, TEXELS}
+
+
+def test_the_closed_form_start_wins_back_the_bumps(bumpy: Asset) -> None:
+    """Bumps that 200 triangles cannot have: distance of the drawn mesh from the true surface."""
+    flat = simplify(bumpy, None, simplify_options(triangles=200, **{**QUICK, "steps": 0})).asset
+    relief = simplify(bumpy, None, options(steps=0)).shown
+    truth = bumpy.meshes[0].positions
+    error = [float(np.mean(_nearest(truth, a))) for a in (flat, relief)]
+    assert error[1] < error[0] / 4  # measured FILL_RATIO
+
+
+def _nearest(points: np.ndarray, asset: Asset) -> np.ndarray:
+    from trimesh import Trimesh
+    from trimesh.proximity import closest_point
+
+    mesh = asset.meshes[0]
+    every = points[:: max(1, len(points) // 500)]
+    return closest_point(Trimesh(mesh.positions, mesh.faces, process=False), every)[1]
+
+
+def test_a_file_to_start_from_brings_its_triangles(bumpy: Asset, tmp_path: Path) -> None:
+    simplify(bumpy, tmp_path / "bad.glb", simplify_options(triangles=150, **{**QUICK, "steps": 0}))
+    o = simplify_options(init=str(tmp_path / "bad.glb"), displacement=True, subdivision=1, **QUICK)
+    result = simplify(bumpy, tmp_path / "x.glb", o)
+    assert result.triangles == load(tmp_path / "bad.glb").triangle_count
+    assert result.shown.triangle_count == 4 * result.triangles
+
+
+def test_joint_bake_keeps_topology_and_texture_coordinates(bumpy: Asset, tmp_path: Path) -> None:
+    low = simplify(bumpy, tmp_path / "low.glb", simplify_options(triangles=200, **{**QUICK, "steps": 0})).asset
+    o = bake_options(joint=True, subdivision="2", samples=1, **QUICK)
+    result = joint(bumpy, tmp_path / "low.glb", tmp_path / "out.usda", o)
+    before, after = load(tmp_path / "low.glb").meshes[0], result.asset.meshes[0]
+    assert len(after.faces) == len(before.faces) == low.triangle_count
+    np.testing.assert_array_equal(after.uvs[after.faces], before.uvs[before.faces])
+    moved = np.linalg.norm(after.positions[after.faces] - before.positions[before.faces], axis=-1)
+    assert 0 < moved.max() < 0.05  # a few steps
+    assert result.shown.triangle_count == 16 * low.triangle_count
+    assert (tmp_path / "out.usda").is_file() and after.material.displacement is not None
