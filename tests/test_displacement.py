@@ -15,6 +15,7 @@ from appearance_opt.initial.sphere import sphere
 from appearance_opt.latent.displacement import DISPLACEMENT, Tessellator, footprint, share
 from appearance_opt.latent.subdivision import tessellate
 from appearance_opt.latent.texels import TexelCodec
+from appearance_opt.reference.pool import Targets
 from appearance_opt.render.deferred import Grid
 from appearance_opt.render.gradient import Quality
 from appearance_opt.views import look_at
@@ -207,7 +208,7 @@ def test_derivatives_of_the_image(of: str) -> None:
     views = inside_view()
     grid = Grid(2, 96)
     reference = mi.Float(np.tile(np.array([0.1, 0.1, 0.1, 1], np.float32), grid.pixels))
-    inputs = StepInputs(views, reference, np.zeros((2, 3), np.float32), 0.0, 0.0, 3)
+    inputs = StepInputs(views, Targets(reference), np.zeros((2, 3), np.float32), 0.0, 0.0, 3)
     quality = Quality(0.0, 1, 4)
 
     def run() -> tuple[float, dict]:
