@@ -64,8 +64,8 @@ def test_the_level_of_an_iteration_can_be_replayed() -> None:
 
 
 def test_too_much_is_refused_with_the_number(bumpy: Asset, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(backend, "available_memory", lambda: 3 << 30)
-    message = r"5000 triangles become 1280000, which takes about \d\.\d GiB, and 3\.0 GiB are free"
+    monkeypatch.setattr(backend, "available_memory", lambda: 1 << 30)
+    message = r"5000 triangles become 1280000, which takes about \d\.\d GiB, and 1\.0 GiB are free"
     with pytest.raises(InputError, match=message) as error:
         simplify(bumpy, None, options(triangles=5000, subdivision=4))
     assert "\n" not in str(error.value)

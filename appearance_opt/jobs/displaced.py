@@ -14,9 +14,9 @@ from appearance_opt import backend
 from appearance_opt.asset import save
 from appearance_opt.asset.height import displacement_of, height_png
 from appearance_opt.asset.paths import replacing
-from appearance_opt.bake.closed_form import Settings, bake
 from appearance_opt.errors import InputError
 from appearance_opt.initial.atlas import GUTTER
+from appearance_opt.initial.relief import relief
 from appearance_opt.latent.displacement import DISPLACEMENT, Tessellator, footprint
 from appearance_opt.latent.export import to_asset
 from appearance_opt.latent.subdivision import tessellate
@@ -86,7 +86,7 @@ def displaced(
     """Closed form: the displacement map that rays along the interpolated normals find, and the mesh that it makes
     at the finest level, to whose frames the other maps belong."""
     size = map_size(mesh, options)
-    found = bake(reference, mesh, Settings(size, (DISPLACEMENT,), samples=4)).maps[DISPLACEMENT]
+    found = relief(reference, mesh, size)
     with dr.suspend_grad():
         tessellator = Tessellator(mesh, max(options.levels()), tangents=False)
         codec = TexelCodec((DISPLACEMENT,), size)
