@@ -80,7 +80,7 @@ def test_the_map_is_as_fine_as_the_mesh() -> None:
     mesh = movable(prepare(load_ball()).mesh)
     size = map_size(mesh, options(texture_size=1024))
     texels = size * np.sqrt(np.median(footprint(tessellate(mesh, 3).mesh)))
-    assert 1 <= texels < 2  # texels per edge of the finest mesh
+    assert 1 <= texels < 2  # texels per half edge of the finest mesh
     assert map_size(mesh, options(texture_size=32)) == 32
 
 

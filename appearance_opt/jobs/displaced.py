@@ -14,9 +14,9 @@ from appearance_opt import backend
 from appearance_opt.asset import save
 from appearance_opt.asset.height import displacement_of, height_png
 from appearance_opt.asset.paths import replacing
+from appearance_opt.bake.closed_form import Settings, bake
 from appearance_opt.errors import InputError
 from appearance_opt.initial.atlas import GUTTER
-from appearance_opt.initial.relief import relief
 from appearance_opt.latent.displacement import DISPLACEMENT, Tessellator, footprint
 from appearance_opt.latent.export import to_asset
 from appearance_opt.latent.subdivision import tessellate
@@ -35,6 +35,10 @@ FILLED = 0.6
 """Share of an atlas that its charts cover, about."""
 
 MAX_GUTTER = 16
+
+SAMPLES = 4
+"""Rays per texel of the closed-form displacement. Hits on walls that are steep to the ray are kept: leaving them out
+costs 0.9 dB on chess_king, whose rims are such walls."""
 
 BYTES_PER_TRIANGLE = 900
 """Peak memory of a fit for each tessellated triangle, all levels together (docs/displacement.md)."""
@@ -60,7 +64,7 @@ def require_memory(triangles: int, options: CommonOptions) -> None:
 
 def gutter(triangles: int, options: CommonOptions) -> int:
     """Texels between the charts of a new atlas: two edges of the finest tessellation, for a vertex on the rim of
-    a chart reads its displacement from texels of about an edge's length on both sides."""
+    a chart reads its displacement from texels on both sides, in coarser mip levels where its edges are longer."""
     if not options.displaced:
         return GUTTER
     area = FILLED * options.texture_size**2 / (triangles * 4 ** max(options.levels()))
@@ -68,10 +72,10 @@ def gutter(triangles: int, options: CommonOptions) -> int:
 
 
 def map_size(mesh: LatentMesh, options: CommonOptions) -> int:
-    """Texels per side of the displacement map: the power of two at which a texel is just not longer than an edge
-    of the finest tessellation. More could not be told apart by the mesh, and would be fitted by nothing."""
-    edge = float(np.sqrt(np.median(footprint(tessellate(mesh, max(options.levels())).mesh))))
-    return int(np.clip(2 ** np.ceil(np.log2(1 / max(edge, 1e-6))), 16, options.texture_size))
+    """Texels per side of the displacement map: the power of two at which a texel is just not longer than half an
+    edge of the finest tessellation, which is what its vertices read."""
+    half_edge = float(np.sqrt(np.median(footprint(tessellate(mesh, max(options.levels())).mesh))))
+    return int(np.clip(2 ** np.ceil(np.log2(1 / max(half_edge, 1e-6))), 16, options.texture_size))
 
 
 def flat_map(mesh: LatentMesh, options: CommonOptions) -> NDArray[np.float32]:
@@ -86,7 +90,7 @@ def displaced(
     """Closed form: the displacement map that rays along the interpolated normals find, and the mesh that it makes
     at the finest level, to whose frames the other maps belong."""
     size = map_size(mesh, options)
-    found = relief(reference, mesh, size)
+    found = bake(reference, mesh, Settings(size, (DISPLACEMENT,), samples=SAMPLES)).maps[DISPLACEMENT]
     with dr.suspend_grad():
         tessellator = Tessellator(mesh, max(options.levels()), tangents=False)
         codec = TexelCodec((DISPLACEMENT,), size)

@@ -85,9 +85,12 @@ class Tessellator:
 
 
 def footprint(mesh: LatentMesh) -> NDArray[np.float32]:
-    """(R,) UV area that a render vertex stands for: the square of the mean UV length of its edges. A lookup
-    with it reads the mip level at which one texel is as long as one edge: finer texels could not be
-    told apart by this mesh, and would alias."""
+    """(R,) UV area that a render vertex stands for: the square of half the mean UV length of its edges.
+
+    A lookup with it reads the mip level at which a texel is half as long as an edge, and a bilinear one, whose weights
+    reach a texel far on both sides, averages over one edge in all: finer detail could not be held by this mesh, and
+    would alias. Texels as long as an edge average over two, which costs 1.4 dB on chess_king's start.
+    """
     length, count = np.zeros(len(mesh.uvs)), np.zeros(len(mesh.uvs))
     for a, b in ((0, 1), (1, 2), (2, 0)):
         i, j = mesh.frame_faces[:, a], mesh.frame_faces[:, b]
@@ -95,7 +98,7 @@ def footprint(mesh: LatentMesh) -> NDArray[np.float32]:
         for k in (i, j):
             length += np.bincount(k, edge, len(length))
             count += np.bincount(k, minlength=len(count))
-    return np.square(length / np.maximum(count, 1)).astype(np.float32)
+    return np.square(0.5 * length / np.maximum(count, 1)).astype(np.float32)
 
 
 def share(mesh: LatentMesh) -> NDArray[np.float32]:
