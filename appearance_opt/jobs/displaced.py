@@ -14,7 +14,7 @@ from appearance_opt import backend
 from appearance_opt.asset import save
 from appearance_opt.asset.height import displacement_of, height_png
 from appearance_opt.asset.paths import replacing
-from appearance_opt.bake.closed_form import Settings, bake
+from appearance_opt.baking.closed_form import Settings, bake
 from appearance_opt.errors import InputError
 from appearance_opt.initial.atlas import GUTTER
 from appearance_opt.latent.displacement import DISPLACEMENT, Tessellator, footprint

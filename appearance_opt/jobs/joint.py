@@ -65,8 +65,8 @@ def joint(
 
 
 def _fitted(job, light: Asset, options: BakeOptions, progress: Progress | None, with_report: bool) -> SimplifyResult:
-    from appearance_opt.bake.closed_form import Settings, bake
-    from appearance_opt.bake.low import movable
+    from appearance_opt.baking.closed_form import Settings, bake
+    from appearance_opt.baking.low import movable
     from appearance_opt.fit.model import Model, Rates
     from appearance_opt.jobs.displaced import Exporter, displaced
     from appearance_opt.jobs.fitting import clean_maps, fit_start
