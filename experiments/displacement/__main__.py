@@ -97,11 +97,11 @@ def table(rows: list[dict]) -> str:
     return "\n".join(lines)
 
 
-def growth(asset: str, triangles: int) -> None:
+def growth(asset: str, triangles: int, steps: int, levels: list[int]) -> None:
     """Time per step and memory by level."""
     print("| level | triangles drawn | ms per step (4 x 256^2) | peak GiB |\n|---|---|---|---|")
-    for level in range(5):
-        values = json.dumps({"triangles": triangles, "steps": 40, "pool": 16})
+    for level in levels:
+        values = json.dumps({"triangles": triangles, "steps": steps, "pool": 16})
         r = run(GROWTH, str(source_of(asset)), str(level), values)
         print(f"| {level} | {r['drawn']} | {r['ms']:.0f} | {r['peak_gib']:.2f} |", flush=True)
 
@@ -113,11 +113,13 @@ def main() -> None:
     parser.add_argument("--triangles", type=int, default=1000)
     parser.add_argument("--budget", type=float, default=60.0)
     parser.add_argument("--steps", type=int)
+    parser.add_argument("--levels", default="0,1,2,3,4", help="for --growth")
     parser.add_argument("--growth", action="store_true")
     parser.add_argument("--table", action="store_true")
     a = parser.parse_args()
     if a.growth:
-        growth(a.assets.split(",")[0], a.triangles)
+        levels = [int(k) for k in a.levels.split(",")]
+        growth(a.assets.split(",")[0], a.triangles, a.steps or 40, levels)
         return
     OUT.mkdir(parents=True, exist_ok=True)
     path = OUT / "results.json"
