@@ -108,15 +108,19 @@ def _reallocated(
 ) -> Start:
     """The best of a start and those with triangles moved to where its image error is."""
     judge = StartError(reference, sampler)
-    best, (error, by_face) = start, judge.measure(start.drawn, start.maps)
+    best, (error, by_face) = start, judge.measure(start.drawn, _images(start))
     for number in range(1, rounds + 1):
         weight = weight * weights(reference.merged.positions, reference.merged.faces, by_face, visible)
         candidate = decimated(weight)
-        again, by_face = judge.measure(candidate.drawn, candidate.maps)
+        again, by_face = judge.measure(candidate.drawn, _images(candidate))
         log.info("triangles moved, round %d: squared error of the start %.3g -> %.3g", number, error, again)
         if again < error:
             best, error = candidate, again
     return best
+
+
+def _images(start: Start) -> dict[str, NDArray]:
+    return {name: np.asarray(value) for name, value in start.maps.items() if np.ndim(value)}
 
 
 def transferred(reference: MeshReference, mesh: LatentMesh, options: SimplifyOptions) -> Start:
