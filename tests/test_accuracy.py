@@ -17,6 +17,10 @@ from appearance_opt.render.deferred import Grid
 from appearance_opt.render.gradient import Quality
 from appearance_opt.views import ViewSampler
 from experiments.accuracy import physics, stages, textures
+from experiments.gradient_error.estimators import Ours
+from experiments.gradient_error.metrics import error_of
+from experiments.gradient_error.problems import make_problem, smooth_fields
+from experiments.gradient_error.reference import Supersampler, pixel_losses
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 4, 7, 8, 16, 64, 256])
@@ -122,3 +126,22 @@ def test_tangents_equal_those_of_mikktspace(name: str) -> None:
     np.testing.assert_array_equal(corners[..., 3], expected[..., 3])
     # measured 1.6e-5 (0.0009 degrees) among slivers, 2.5e-6 elsewhere: MikkTSpace works in single precision
     np.testing.assert_allclose(corners[..., :3], expected[..., :3], atol=5e-5)
+
+
+def test_vertex_gradients_of_a_triangle_are_those_of_its_box_filtered_image() -> None:
+    problem = make_problem("triangle", 64)
+    every = np.arange(64 * 64)
+    target = Supersampler(problem, problem.target_positions, problem.target_colors).image(every, 256, 1)
+    view = Supersampler(problem, problem.positions, problem.colors)
+    fields = smooth_fields(problem.positions, 6, 1)
+    step = problem.step * problem.pixel_size
+    truth = np.zeros(len(fields))
+    for k, field in enumerate(fields):
+        for sign in (1, -1):
+            view.move(problem.positions + sign * step * field)
+            truth[k] += sign * pixel_losses("log-srgb-l1", view.image(every, 512, 0), target) / (2 * step * target.size)
+    ours = Ours(problem, target, "log-srgb-l1")
+    g = np.stack([ours(Quality(2.0, 4, 1), seed) for seed in range(4)])
+    error = error_of(np.einsum("rvc,nvc->rn", g, fields), truth)
+    # measured 0.035 and +1.8 %; at 128 squared pixels 0.27 and -23 % by four rays off centre alone
+    assert error.relative < 0.08 and abs(error.bias) < 0.03
