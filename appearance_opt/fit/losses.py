@@ -12,7 +12,7 @@ import drjit as dr
 import mitsuba as mi
 
 from appearance_opt.errors import InputError
-from appearance_opt.render.math import at_least
+from appearance_opt.render.math import at_least, at_most
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -27,12 +27,26 @@ def srgb(x: mi.Color3f) -> mi.Color3f:
 
 def tone_map(x: mi.Color3f) -> mi.Color3f:
     """x' = srgb(log(x + 1)): Hasselgren et al. 2021, equation 4."""
-    return srgb(dr.log(at_least_color(x, 0) + 1))
+    return srgb(log1p(at_least_color(x, 0)))
+
+
+def log1p(x: mi.Color3f) -> mi.Color3f:
+    """log(1 + x) of non-negative x with all digits of small ones: by its series below 0.1 (error 2e-8)."""
+    small = at_most_color(x, 0.1)
+    series = mi.Color3f(1 / 7)
+    for k in range(6, 0, -1):
+        series = 1 / k - small * series
+    return dr.select(x < 0.1, small * series, dr.log(x + 1))
 
 
 def at_least_color(x: mi.Color3f, low: float) -> mi.Color3f:
     """Per-channel lower bound."""
     return mi.Color3f(at_least(x.x, low), at_least(x.y, low), at_least(x.z, low))
+
+
+def at_most_color(x: mi.Color3f, high: float) -> mi.Color3f:
+    """Per-channel upper bound."""
+    return mi.Color3f(at_most(x.x, high), at_most(x.y, high), at_most(x.z, high))
 
 
 def log_srgb_l1(image: mi.Color3f, reference: mi.Color3f) -> mi.Color3f:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from appearance_opt.render.math import clamp
+from appearance_opt.render.math import at_least
 
 TINY = 1e-20
 
@@ -92,5 +92,7 @@ def unit(v: mi.Vector3f) -> mi.Vector3f:
 
 
 def _angle(a: mi.Vector3f, b: mi.Vector3f) -> mi.Float:
-    """Angle between unit vectors, with a finite derivative for parallel ones."""
-    return dr.acos(clamp(dr.dot(a, b), -1 + 1e-6, 1 - 1e-6))
+    """Angle between vectors, as exact for thin corners as for wide ones (the arc cosine loses half of its digits
+    there), with a finite derivative for parallel ones."""
+    sine = dr.sqrt(at_least(dr.squared_norm(dr.cross(a, b)), 1e-16))
+    return dr.atan2(sine, dr.dot(a, b))

@@ -31,7 +31,7 @@ from experiments.gradient_error.problems import make_problem, problem_names
 from experiments.gradient_error.reference import Truth, truth
 
 OUT = Path("out/gradient_error")
-REPEATS, TIMED = 8, 12
+REPEATS, TIMED = 6, 8
 
 SETTINGS = {
     "none": Quality(0.0, 1, 1),

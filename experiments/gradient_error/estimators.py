@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from appearance_opt.fit.losses import LOSSES
 from appearance_opt.fit.model import POSITIONS, Model, Rates
 from appearance_opt.fit.step import StepInputs, gradients
+from appearance_opt.reference.pool import Targets
 from appearance_opt.render.deferred import Grid
 from appearance_opt.render.gradient import Quality
 from appearance_opt.render.surface import Surface
@@ -40,7 +41,8 @@ class Ours:
         self.grid = Grid(1, problem.resolution)
         rgba = np.ones((len(target), 4), np.float32)
         rgba[:, :3] = target
-        self.inputs = StepInputs(problem.views, mi.Float(rgba.ravel()), np.array([BACKGROUND], np.float32), 0.0, 0.0, 0)
+        reference = Targets(mi.Float(rgba.ravel()))
+        self.inputs = StepInputs(problem.views, reference, np.array([BACKGROUND], np.float32), 0.0, 0.0, 0)
 
     def __call__(self, quality: Quality, seed: int) -> NDArray[np.float32]:
         """dLoss/dPositions (V, 3)."""

@@ -46,7 +46,7 @@ class Problem:
     eye: tuple[float, float, float]
     roughness: float = 0.6
     metalness: float = 0.0
-    step: float = 0.1
+    step: float = 1 / 30
 
     @property
     def views(self) -> Views:
@@ -117,8 +117,8 @@ def make_problem(name: str, resolution: int = 128) -> Problem:
         (colors * shade[:, None]).astype(f32),
         resolution,
         tuple(DISTANCE * np.asarray(eye) / np.linalg.norm(eye)),
-        # at 4 degrees a tenth of a pixel changes the cosine by a tenth: too far for a difference
-        step=0.025 if name == "grazing" else 0.1,
+        # faces seen at grazing angles turn away within a tenth of a pixel: too far for a difference
+        step=1 / 40 if name == "grazing" else 1 / 30,
     )
 
 

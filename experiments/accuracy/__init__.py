@@ -1,0 +1,1 @@
+"""How accurate is every stage on its own? See ``__main__``."""
