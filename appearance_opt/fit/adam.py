@@ -41,22 +41,38 @@ def moments_of(parameter: Parameter) -> Moments:
 def update(parameter: Parameter, gradient: mi.Float, moments: Moments, rate: float) -> tuple[mi.Float, Moments]:
     """(new value, new moments) after one step; ``rate`` multiplies the parameter's own rates."""
     steps = moments.steps + 1
+    if parameter.smooth is not None:
+        gradient = parameter.smooth(gradient)
     first = dr.fma(moments.first, BETA_1, gradient * (1 - BETA_1))
     second = dr.fma(moments.second, BETA_2, dr.square(gradient) * (1 - BETA_2))
     # bias corrections and rate change every step: opaque, or each step would compile a kernel
     scale = dr.opaque(mi.Float, rate / (1 - BETA_1**steps))
     correction = dr.opaque(mi.Float, 1 / (1 - BETA_2**steps))
-    step = first * scale / (dr.sqrt(second * correction) + EPSILON)
-    if dr.width(parameter.rate) == dr.width(parameter.value):
-        value = parameter.value - parameter.rate * step
+    if parameter.smooth is None:
+        step = first * scale / (dr.sqrt(second * correction) + EPSILON)
     else:
-        channel = dr.arange(mi.UInt32, dr.width(parameter.value)) & (parameter.channels - 1)
-        value = parameter.value - dr.gather(mi.Float, parameter.rate, channel) * step
-        if parameter.low is not None and parameter.high is not None:
-            value = clamp(
-                value, dr.gather(mi.Float, parameter.low, channel), dr.gather(mi.Float, parameter.high, channel)
-            )
+        # one scale for all: a scale per element would undo the smoothness (Nicolet et al. 2021, section 4.3)
+        step = parameter.smooth(first * scale / (dr.sqrt(dr.max(second) * correction) + EPSILON))
+    value = _bounded(parameter, parameter.value - _rates(parameter) * step)
     share = dr.opaque(mi.Float, (AVERAGING + 1) / (steps + AVERAGING))
     mean = dr.fma(value - moments.mean, share, moments.mean)
     dr.eval(value, first, second, mean)
     return value, Moments(first, second, mean, steps)
+
+
+def _rates(parameter: Parameter) -> mi.Float:
+    """Rate of every element."""
+    if dr.width(parameter.rate) in (1, dr.width(parameter.value)):
+        return parameter.rate
+    return dr.gather(mi.Float, parameter.rate, _channel(parameter))
+
+
+def _bounded(parameter: Parameter, value: mi.Float) -> mi.Float:
+    if parameter.low is None or parameter.high is None:
+        return value
+    channel = _channel(parameter)
+    return clamp(value, dr.gather(mi.Float, parameter.low, channel), dr.gather(mi.Float, parameter.high, channel))
+
+
+def _channel(parameter: Parameter) -> mi.UInt32:
+    return dr.arange(mi.UInt32, dr.width(parameter.value)) & (parameter.channels - 1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -81,7 +82,8 @@ def fit_start(
     rather than raised: the state is worth writing first.
     """
     o = options
-    pool = ReferencePool(reference, sampler, o.pool, o.views, o.resolution, POOL_SAMPLES)
+    width = point_width(o.resolution, o.texture_size)
+    pool = ReferencePool(reference, sampler, o.pool, o.views, o.resolution, POOL_SAMPLES, width)
     held_out = sampler.held_out(1).draw(0, VALIDATION_VIEWS)
     validation = Validation(reference, held_out, min(o.resolution, 256))
     parts = frozenset(o.fit) | ({DISPLACEMENT} if o.displaced else set())
@@ -90,6 +92,7 @@ def fit_start(
     given = (o.position_rate, o.normal_rate, o.color_rate, o.material_rate, o.displacement_rate)
     defaults = (rates.position, rates.normal, rates.base_color, rates.material, rates.displacement)
     model.set_rates(Rates(*(d if g is None else g for g, d in zip(given, defaults, strict=True))))
+    quality = replace(quality, point_width=width)
     watch.lap("set-up")
     seconds = None
     if o.budget is not None:
@@ -112,6 +115,12 @@ def fit_start(
         error, fitted = diverged, FitResult()
     watch.lap("fit")
     return model, fitted, error
+
+
+def point_width(resolution: int, texture_size: int) -> float:
+    """Width in pixels of the filter of point samples: about a texel, if the object fills both the view and the
+    atlas. Narrower would compare single texels with detail that they cannot hold, wider would blur."""
+    return float(np.clip(1.25 * resolution / texture_size, 0.4, 2.0))
 
 
 def effort(psnr: float, likeness: bool) -> tuple[Quality, Rates]:

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     import mitsuba as mi
 
 
@@ -14,7 +16,8 @@ class Parameter:
     """One fitted quantity: a flat device array of packets of ``channels`` floats.
 
     ``rate``: learning rates, one per channel (``channels`` values) or one per element (as wide as
-    ``value``). ``low``, ``high``: bounds per channel, or None.
+    ``value``). ``low``, ``high``: bounds per channel, or None. ``smooth``: a symmetric linear map that
+    preconditions its steps (see ``fit.smoothing``), or None.
     """
 
     name: str
@@ -23,3 +26,4 @@ class Parameter:
     rate: mi.Float
     low: mi.Float | None = None
     high: mi.Float | None = None
+    smooth: Callable[[mi.Float], mi.Float] | None = None
