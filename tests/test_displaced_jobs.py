@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -17,14 +18,20 @@ from appearance_opt.asset.validate import validate
 from appearance_opt.baking.low import movable, prepare
 from appearance_opt.config import bake_options, simplify_options
 from appearance_opt.errors import InputError
-from appearance_opt.fit.loop import level_of
+from appearance_opt.fit import loop
+from appearance_opt.fit.loop import FitOptions, level_of
 from appearance_opt.fit.model import POSITIONS, TEXELS, Model, Rates
+from appearance_opt.fit.validation import Validation
+from appearance_opt.initial.sphere import sphere
 from appearance_opt.jobs.displaced import map_size
 from appearance_opt.jobs.joint import joint
 from appearance_opt.jobs.simplify import simplify
 from appearance_opt.latent.displacement import DISPLACEMENT, Tessellator, footprint
 from appearance_opt.latent.subdivision import tessellate
 from appearance_opt.latent.texels import TexelCodec
+from appearance_opt.reference.mesh import MeshReference
+from appearance_opt.reference.pool import ReferencePool
+from appearance_opt.views import ViewSampler
 from scenes.analytic import bumps, bumpy_sphere
 
 QUICK = {"texture_size": 128, "resolution": 48, "pool": 8, "views": 2, "steps": 3}
@@ -177,6 +184,31 @@ def test_a_file_to_start_from_brings_its_triangles(bumpy: Asset, tmp_path: Path)
     result = simplify(bumpy, tmp_path / "x.glb", o)
     assert result.triangles == load(tmp_path / "bad.glb").triangle_count
     assert result.shown.triangle_count == 4 * result.triangles
+
+
+def test_changing_levels_compiles_nothing_after_the_first_steps(bumpy: Asset) -> None:
+    reference = MeshReference(bumpy)
+    sampler = ViewSampler((0.0, 0.0, 0.0), 1.4, seed=1)
+    flat = np.zeros((32, 32), np.float32)
+    maps = {"red": flat + 0.5, "green": flat + 0.5, "blue": flat + 0.5, DISPLACEMENT: flat}
+    mesh = sphere(150, (0.0, 0.0, 0.0), 1.0, 32)
+    model = Model(mesh, maps, frozenset({"shape", "material", DISPLACEMENT}), Rates(), (1, 2))
+    validation = Validation(reference, sampler.held_out(1).draw(0, 2), 32)
+    fit_options = FitOptions(steps=1000)
+    run = loop._Run(model, ReferencePool(reference, sampler, 8, 2, 32, 4), validation, fit_options, None, None)
+    seen = {model.level}
+    for _ in range(24):  # the pool of 8 views is full after 4
+        run.advance()
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        for _ in range(8):
+            run.advance()
+            seen.add(model.level)
+        history = dr.kernel_history()
+    missed = [k for k in history if k["type"] == dr.KernelType.JIT and not k["cache_hit"]]
+    # measured 0 or 1 in eight steps (a branch that no step took before); compiling at each change of level, or in
+    # each step, would be 4 and more
+    assert seen == {1, 2} and history and len(missed) <= 1
 
 
 def test_joint_bake_keeps_topology_and_texture_coordinates(bumpy: Asset, tmp_path: Path) -> None:

@@ -1,13 +1,12 @@
 """Division of labour: what do a normal map, a displacement map, and both add to 1,000 triangles?
 
     python -m experiments.displacement [--assets chess_king,flight_helmet,relic] [--budget 60] [--triangles 1000]
-    python -m experiments.displacement --growth
+    python -m experiments.displacement --table
 
 Per asset, at level 3: the base mesh with a normal map; displacement alone; both; and a mesh of 16 times the base
-triangles with a normal map, simplified directly. All are judged as they are drawn, on held-out views. ``--growth``:
-time per step and peak memory for levels 0 to 4 of 1,000 triangles. Results are appended to
-``out/displacement/results.json`` row by row; a row that is there with the same settings is not run again.
-Needs ``../shared/judge/references`` for the first two assets.
+triangles with a normal map, simplified directly. All are judged as they are drawn, on held-out views.
+Results are appended to ``out/displacement/results.json`` row by row; a row that is there with the same settings is
+not run again. Needs ``../shared/judge/references`` for the first two assets.
 """
 
 from __future__ import annotations
@@ -37,19 +36,6 @@ m = {n: compare(source, x, views=16).metrics for n, x in (("start", r.start), ("
 names = ("psnr_covered", "flip", "silhouette_shift", "silhouette_iou")
 print(json.dumps({"seconds": r.seconds, "steps": r.fit.steps, "drawn": r.shown.triangle_count,
                   **{k: {n: getattr(v, n) for n in names} for k, v in m.items()}}))
-"""
-GROWTH = """
-import json, resource, sys, time, appearance_opt as a
-level, values = int(sys.argv[2]), json.loads(sys.argv[3])
-times = []
-class Watch:
-    def update(self, *_):
-        times.append(time.perf_counter())
-r = a.simplify(sys.argv[1], None, a.simplify_options("default", **values, displacement=True, subdivision=level),
-               progress=Watch())
-gaps = sorted(b - t for t, b in zip(times[5:], times[6:]))
-print(json.dumps({"drawn": r.shown.triangle_count, "ms": 1000 * gaps[len(gaps) // 2],
-                  "peak_gib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20}))
 """
 
 
@@ -97,15 +83,6 @@ def table(rows: list[dict]) -> str:
     return "\n".join(lines)
 
 
-def growth(asset: str, triangles: int, steps: int, levels: list[int]) -> None:
-    """Time per step and memory by level."""
-    print("| level | triangles drawn | ms per step (4 x 256^2) | peak GiB |\n|---|---|---|---|")
-    for level in levels:
-        values = json.dumps({"triangles": triangles, "steps": steps, "pool": 16})
-        r = run(GROWTH, str(source_of(asset)), str(level), values)
-        print(f"| {level} | {r['drawn']} | {r['ms']:.0f} | {r['peak_gib']:.2f} |", flush=True)
-
-
 def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--assets", default="chess_king,flight_helmet,relic")
@@ -113,14 +90,8 @@ def main() -> None:
     parser.add_argument("--triangles", type=int, default=1000)
     parser.add_argument("--budget", type=float, default=60.0)
     parser.add_argument("--steps", type=int)
-    parser.add_argument("--levels", default="0,1,2,3,4", help="for --growth")
-    parser.add_argument("--growth", action="store_true")
     parser.add_argument("--table", action="store_true")
     a = parser.parse_args()
-    if a.growth:
-        levels = [int(k) for k in a.levels.split(",")]
-        growth(a.assets.split(",")[0], a.triangles, a.steps or 40, levels)
-        return
     OUT.mkdir(parents=True, exist_ok=True)
     path = OUT / "results.json"
     rows = json.loads(path.read_text()) if path.exists() else []
