@@ -58,6 +58,8 @@ def error_against_time(rows: list[dict[str, str]], path: Path) -> None:
             ("direct_projective", "#2c6fbb", "^"), ("prb_projective", "#5a9e6f", "v"),
         ):  # fmt: skip
             own = [r for r in here if r["estimator"].startswith(family)]
+            if not own:
+                continue
             x, y = [float(r["milliseconds"]) for r in own], [float(r["fields_relative"]) for r in own]
             axis.loglog(x, y, marker=marker, color=colour, label=family, linewidth=1, markersize=5)
         axis.axhline(0.08, color="black", linewidth=0.6, linestyle=":")
