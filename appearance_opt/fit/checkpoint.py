@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-FILE = "fit.npz"
+FILE, START_FILE = "fit.npz", "start.npz"
 
 
 @dataclass
@@ -54,6 +54,13 @@ class Checkpointer:
         self.fingerprint, self.resume, self.interval = fingerprint, resume, interval
         self._last = time.monotonic()
         self.path.parent.mkdir(parents=True, exist_ok=True)
+        if not resume:
+            self.start_path.unlink(missing_ok=True)
+
+    @property
+    def start_path(self) -> Path:
+        """Where a start that cannot be made again is kept. Removed unless a job is resumed."""
+        return self.path.with_name(START_FILE)
 
     def due(self) -> bool:
         """Is it time for another checkpoint?"""

@@ -9,6 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from appearance_opt.fit.smoothing import Smoother
 from appearance_opt.latent.displacement import DISPLACEMENT, Tessellator
 from appearance_opt.latent.latent import LatentMesh, LatentTopology, local_edge_length
 from appearance_opt.latent.parameter import Parameter
@@ -171,6 +172,13 @@ class Model:
         if DISPLACEMENT in self.parameters:
             edge = float(self._drawn[max(self.levels)].edge_length.mean())
             self.parameters[DISPLACEMENT].rate = mi.Float(edge * rates.displacement)
+
+    def precondition(self, strength: float, rate: float) -> None:
+        """Smooth the steps of the positions (see ``fit.smoothing``), with a ``rate`` in units of the positions."""
+        parameter = self.parameters.get(POSITIONS)
+        if parameter is not None:
+            parameter.smooth = Smoother(len(self.mesh.positions), self.mesh.faces, strength)
+            parameter.rate = mi.Float(rate)
 
     def positions(self) -> mi.Float:
         """Current flat base positions (3 V)."""

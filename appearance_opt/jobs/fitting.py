@@ -94,10 +94,7 @@ def fit_start(
     model.set_rates(Rates(*(d if g is None else g for g, d in zip(given, defaults, strict=True))))
     quality = replace(quality, point_width=width)
     watch.lap("set-up")
-    seconds = None
-    if o.budget is not None:
-        reserve = EXPORT_SECONDS + (REPORT_SECONDS if with_report else 0.0)
-        seconds = max(o.budget - watch.total - reserve, 0.0)
+    seconds = seconds_left(o, watch, with_report)
     fit_options = FitOptions(
         steps=o.steps if seconds is not None or o.steps is not None else 1000,
         seconds=seconds,
@@ -115,6 +112,14 @@ def fit_start(
         error, fitted = diverged, FitResult()
     watch.lap("fit")
     return model, fitted, error
+
+
+def seconds_left(options: CommonOptions, watch: Stopwatch, with_report: bool) -> float | None:
+    """Seconds of the budget that are left for fitting; None without a budget."""
+    if options.budget is None:
+        return None
+    reserve = EXPORT_SECONDS + (REPORT_SECONDS if with_report else 0.0)
+    return max(options.budget - watch.total - reserve, 0.0)
 
 
 def point_width(resolution: int, texture_size: int) -> float:

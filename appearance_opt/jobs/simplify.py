@@ -13,15 +13,17 @@ import numpy as np
 
 from appearance_opt import backend
 from appearance_opt.asset import check_writable, load, save
-from appearance_opt.config import SimplifyOptions, as_dict
+from appearance_opt.config import SimplifyOptions, as_dict, with_values
 from appearance_opt.errors import DivergedError, InputError
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from appearance_opt.asset.types import Asset
+    from appearance_opt.fit.checkpoint import Checkpointer
     from appearance_opt.fit.loop import FitResult, Progress
     from appearance_opt.jobs.fitting import Stopwatch
+    from appearance_opt.jobs.start import Start
 
 log = logging.getLogger(__name__)
 
@@ -76,8 +78,8 @@ def simplify(
     asset = load(source, refine=options.refine) if isinstance(source, (str, Path)) else source
     watch.lap("load")
     backend.select(options.device)
-    run = _Job(asset, options, watch)
-    result = run.fit(progress, _checkpointer(asset, options, checkpoint, resume), report is not None)
+    run = _Job(asset, options, watch, progress, _checkpointer(asset, options, checkpoint, resume), report is not None)
+    result = run.fit()
     if out is not None:
         save(result.asset, out)
         if options.displaced:
@@ -108,12 +110,21 @@ def check_paths(source: Path | None, out: Path) -> None:
 class _Job:
     """The reference, its frame and the start; then the fit."""
 
-    def __init__(self, asset: Asset, options: SimplifyOptions, watch: Stopwatch) -> None:
+    def __init__(
+        self,
+        asset: Asset,
+        options: SimplifyOptions,
+        watch: Stopwatch,
+        progress: Progress | None,
+        checkpointer: Checkpointer | None,
+        with_report: bool,
+    ) -> None:
         from appearance_opt.jobs.start import budget, loaded_start, make_start
         from appearance_opt.reference.mesh import MeshReference
         from appearance_opt.views import ViewSampler, framing
 
         self.options, self.watch = options, watch
+        self.progress, self.checkpointer, self.with_report = progress, checkpointer, with_report
         points = np.concatenate([m.positions for m in asset.meshes])
         self.frame = framing(points)
         # the fit works on an object of radius 1 around the origin, so that no threshold in it and no
@@ -123,7 +134,9 @@ class _Job:
         self.sampler = ViewSampler(
             (0.0, 0.0, 0.0), 1.0, options.seed, hull=support(self.reference.merged.positions), light=options.light
         )
-        if options.init in ("decimate", "sphere"):
+        if options.init == "sphere" and "shape" in options.fit and not options.displaced:
+            self.start = self._grown(budget(options, asset.triangle_count))
+        elif options.init in ("decimate", "sphere"):
             triangles = budget(options, asset.triangle_count)
             self.start = make_start(self.reference, options, self.sampler, triangles)
         else:
@@ -133,7 +146,33 @@ class _Job:
         self.asset = asset
         watch.lap("start")
 
-    def fit(self, progress: Progress | None, checkpointer, with_report: bool) -> SimplifyResult:
+    def _grown(self, triangles: int) -> Start:
+        """A start grown from a sphere, in a part of the time or the steps."""
+        from appearance_opt.jobs.fitting import seconds_left
+        from appearance_opt.jobs.growth import SHARE, grown, kept
+
+        o = self.options
+        seconds = seconds_left(o, self.watch, self.with_report)
+        steps = 1000 if o.steps is None and seconds is None else o.steps
+
+        def make() -> tuple[Start, bool]:
+            return grown(
+                self.reference,
+                self.sampler,
+                o,
+                triangles,
+                None if seconds is None else SHARE * seconds,
+                None if steps is None else max(1, round(SHARE * steps)),
+                self.progress,
+            )
+
+        start, interrupted = make() if self.checkpointer is None else kept(self.checkpointer.start_path, make)
+        if interrupted:  # Ctrl-C ends both fits
+            self.options = with_values(o, steps=0)
+        return start
+
+    def fit(self) -> SimplifyResult:
+        """Fit the start; see ``simplify``."""
         from appearance_opt.fit.model import Model, Rates
         from appearance_opt.jobs.displaced import Exporter
         from appearance_opt.jobs.fitting import clean_maps, fit_start
@@ -147,9 +186,9 @@ class _Job:
             self.watch,
             laplacian=o.laplacian,
             relative=self.start.relative if o.relative is None else o.relative,
-            progress=progress,
-            checkpointer=checkpointer,
-            with_report=with_report,
+            progress=self.progress,
+            checkpointer=self.checkpointer,
+            with_report=self.with_report,
         )
         name = f"{self.asset.name}_{len(self.start.mesh.faces)}"
         double_sided = any(m.material.double_sided for m in self.asset.meshes)
@@ -197,7 +236,9 @@ def support(positions: NDArray, count: int = 256) -> NDArray[np.float64]:
     return positions[np.unique(best)].astype(np.float64)
 
 
-def _checkpointer(asset: Asset, options: SimplifyOptions, folder: str | Path | None, resume: bool):
+def _checkpointer(
+    asset: Asset, options: SimplifyOptions, folder: str | Path | None, resume: bool
+) -> Checkpointer | None:
     if folder is None:
         if resume:
             raise InputError("--resume needs --checkpoint DIR")

@@ -1,0 +1,127 @@
+"""From a sphere to a first likeness: the start where there is no mesh to decimate, or none is to be used.
+
+The sphere gets several times the triangles of the budget, small maps, small views and preconditioned steps
+(``fit.smoothing``): shape first. What comes out is decimated to the budget like any other mesh, which puts triangles
+where the shape needs them (a sphere that was pulled into limbs has few at their ends), and its maps are transferred to
+an atlas of full size.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import tempfile
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from appearance_opt.errors import InputError
+from appearance_opt.fit.loop import FitOptions, fit
+from appearance_opt.fit.model import Model, Rates
+from appearance_opt.fit.validation import Validation
+from appearance_opt.initial.atlas import unwrap
+from appearance_opt.initial.decimate import decimate
+from appearance_opt.initial.sphere import random_maps, sphere
+from appearance_opt.jobs.fitting import VALIDATION_VIEWS, clean_maps
+from appearance_opt.jobs.start import Start, transferred
+from appearance_opt.latent.export import to_asset
+from appearance_opt.latent.latent import LatentMesh
+from appearance_opt.reference.mesh import MeshReference
+from appearance_opt.reference.pool import ReferencePool
+from appearance_opt.render.gradient import Quality
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from appearance_opt.config import SimplifyOptions
+    from appearance_opt.fit.loop import Progress
+    from appearance_opt.reference.base import Reference
+    from appearance_opt.views import ViewSampler
+
+log = logging.getLogger(__name__)
+
+SHARE = 0.35
+"""Part of the time (or of the steps) that goes into the shape."""
+
+OVERSAMPLING = 3
+"""Triangles of the sphere in units of the budget."""
+
+TEXTURE, RESOLUTION, VIEWS, POOL, POOL_SAMPLES, POINT_WIDTH = 256, 160, 8, 320, 16, 0.7
+TRIANGLES_PER_STRENGTH = 1500
+"""Smoothing strength of the steps grows with the triangles, so that the same part of the surface moves together."""
+
+RATES = Rates(position=0.1, normal=0.01, base_color=0.02, material=0.01)
+"""The position's rate is in units of the object's radius: preconditioned steps know no edge length."""
+
+
+def grown(
+    reference: Reference,
+    sampler: ViewSampler,
+    options: SimplifyOptions,
+    triangles: int,
+    seconds: float | None,
+    steps: int | None,
+    progress: Progress | None = None,
+) -> tuple[Start, bool]:
+    """(start, interrupted) after at most ``seconds`` or ``steps``. Only images of the reference are used."""
+    texture = min(TEXTURE, options.texture_size)
+    mesh = sphere(OVERSAMPLING * triangles, sampler.centre, 0.6 * sampler.radius, texture)
+    model = Model(mesh, random_maps(texture, options.seed, "normal" in options.fit), frozenset(options.fit), RATES)
+    model.precondition(len(mesh.faces) / TRIANGLES_PER_STRENGTH, RATES.position)
+    pool = ReferencePool(reference, sampler, POOL, VIEWS, RESOLUTION, POOL_SAMPLES, POINT_WIDTH)
+    validation = Validation(reference, sampler.held_out(1).draw(0, VALIDATION_VIEWS), RESOLUTION)
+    fit_options = FitOptions(
+        steps=steps,
+        seconds=seconds,
+        loss=options.loss,
+        laplacian=0.0,
+        decay=1.0,
+        background=options.background_color(),
+        quality=Quality(point_width=POINT_WIDTH),
+        seed=options.seed,
+    )
+    result = fit(model, pool, validation, fit_options, progress)
+    log.info("grown from a sphere: %d steps, %.2f dB", result.steps, result.curve[-1].psnr)
+    likeness = to_asset(mesh, model.host_positions(), clean_maps(model, np.zeros((texture, texture), bool)), "grown")
+    source = MeshReference(likeness)
+    positions, faces = decimate(source.merged.positions, source.merged.faces, triangles)
+    if not len(faces):
+        raise InputError("nothing is left of the grown mesh at that budget; ask for more triangles")
+    size = options.texture_size
+    return transferred(source, unwrap(positions, faces, size), size), result.interrupted
+
+
+def kept(path: Path, make: Callable[[], tuple[Start, bool]]) -> tuple[Start, bool]:
+    """A start from ``path``, or made and written there: a resumed fit must go on from the very same one."""
+    if path.exists():
+        try:
+            return _read(path), False
+        except (OSError, KeyError, ValueError, EOFError) as error:
+            raise InputError(f"{path}: not a usable start ({error}); delete it to begin anew") from error
+    start, interrupted = make()
+    _write(path, start)
+    return start, interrupted
+
+
+_MESH = ("positions", "faces", "frame_vertex", "frame_faces", "uvs")
+
+
+def _write(path: Path, start: Start) -> None:
+    arrays = {name: getattr(start.mesh, name) for name in _MESH}
+    arrays.update({f"map/{name}": np.asarray(value) for name, value in start.maps.items()})
+    with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".tmp", delete=False) as file:
+        try:
+            np.savez(file, allow_pickle=False, known=start.known, **arrays)
+            file.flush()
+            os.replace(file.name, path)
+        except BaseException:
+            Path(file.name).unlink(missing_ok=True)
+            raise
+
+
+def _read(path: Path) -> Start:
+    with np.load(path) as file:
+        arrays = {k: file[k] for k in file.files}
+    maps = {k[4:]: v if v.ndim else float(v) for k, v in arrays.items() if k.startswith("map/")}
+    return Start(LatentMesh(*(arrays[name] for name in _MESH)), maps, True, arrays["known"])
