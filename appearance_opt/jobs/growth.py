@@ -88,8 +88,7 @@ def grown(
     positions, faces = decimate(source.merged.positions, source.merged.faces, triangles)
     if not len(faces):
         raise InputError("nothing is left of the grown mesh at that budget; ask for more triangles")
-    size = options.texture_size
-    return transferred(source, unwrap(positions, faces, size), size), result.interrupted
+    return transferred(source, unwrap(positions, faces, options.texture_size), options), result.interrupted
 
 
 def kept(path: Path, make: Callable[[], tuple[Start, bool]]) -> tuple[Start, bool]:
