@@ -29,6 +29,9 @@ JUDGE = ROOT.parent / "shared" / "judge"
 OUT = ROOT / "out" / "baking"
 ROWS = {"chess_king": 4864, "flight_helmet": 2820, "relic": 8182}
 SIZE = 1024
+CAGES = (1.0, 1 / 4, 1 / 16)
+"""Blender's cages, in units of the reach of our rays."""
+
 METRICS = (("psnr_cov", 2), ("flip", 4), ("sil_shift_px", 3))
 
 
@@ -78,14 +81,28 @@ def ours(source: Path, low: Path, stem: Path, preset: str, steps: int | None) ->
 
 
 def blender(python: str, source: Path, low: Path, stem: Path, reach: float) -> dict:
-    """Blender's maps on the same mesh, as a GLB with the same frames, and how far its normals are from ours."""
+    """Blender's bake at the best of several cages: its cage takes the first surface from outside, so one that
+    is wide enough for the whole mesh shows neighbouring parts. Best: nearest to ours in the mean."""
+    script = Path(__file__).with_name("blender_bake.py")
+    tried = {}
+    for share in CAGES:
+        folder = Path(f"{stem}_blender_{share:g}")
+        if not (folder / "seconds.json").exists():
+            command = [python, str(script), str(source), str(low), str(folder), str(SIZE), str(share * reach), "4"]
+            subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+        seconds = json.loads((folder / "seconds.json").read_text())
+        apart = angles(stem, np.load(folder / "normal.npy"))
+        tried[share] = {"cage": share * reach, "seconds": sum(seconds.values()), "seconds_by_map": seconds, **apart}
+    best = min(tried, key=lambda share: tried[share]["angle_mean"])
+    blender_asset(stem, Path(f"{stem}_blender_{best:g}"))
+    return {**tried[best], "tried": tried}
+
+
+def blender_asset(stem: Path, folder: Path) -> None:
+    """Blender's maps on the same mesh with the same frames, as a GLB."""
     from appearance_opt import load, save
     from appearance_opt.asset.types import Asset, Material, Texture
 
-    folder = Path(f"{stem}_blender")
-    script = Path(__file__).with_name("blender_bake.py")
-    command = [python, str(script), str(source), str(low), str(folder), str(SIZE), str(reach), "4"]
-    subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
     maps = {n: np.load(folder / f"{n}.npy") for n in ("normal", "base_color", "roughness", "metalness")}
     byte = {n: np.round(m / 257).astype(np.uint8) for n, m in maps.items()}
     orm = np.stack([np.full((SIZE, SIZE), 255, np.uint8), byte["roughness"][..., 0], byte["metalness"][..., 0]], -1)
@@ -99,8 +116,6 @@ def blender(python: str, source: Path, low: Path, stem: Path, reach: float) -> d
     )
     mesh = load(f"{stem}_closed.glb").meshes[0]
     save(Asset((replace(mesh, material=material),), "blender"), f"{stem}_blender.glb")
-    seconds = json.loads((folder / "seconds.json").read_text())
-    return {"seconds": sum(seconds.values()), "seconds_by_map": seconds, **angles(stem, maps["normal"])}
 
 
 def angles(stem: Path, theirs: np.ndarray) -> dict:
