@@ -47,13 +47,12 @@ def source_of(asset: str) -> Path:
 
 def make_low(source: Path, triangles: int, path: Path) -> None:
     """Decimated and unwrapped, no material."""
-    from appearance_opt import backend, save
+    from appearance_opt import save
     from appearance_opt.asset import load
     from appearance_opt.asset.types import Asset, Mesh
     from appearance_opt.config import simplify_options
     from appearance_opt.jobs.simplify import simplify
 
-    backend.select("cpu")
     options = simplify_options("draft", triangles=triangles, steps=0, pool=4, texture_size=SIZE)
     low = simplify(load(source), None, options).start.meshes[0]
     bare = Mesh(low.positions, low.faces, low.normals, low.uvs, low.tangents, name="low")
@@ -132,7 +131,17 @@ def angles(stem: Path, theirs: np.ndarray) -> dict:
     a, b = (v / np.maximum(np.linalg.norm(v, axis=1, keepdims=True), 1e-9) for v in vectors)
     angle = np.degrees(np.arccos(np.clip(np.sum(a * b, axis=1), -1, 1)))
     quantiles = {f"angle_{q}": float(np.percentile(angle, q)) for q in (50, 90, 99)}
-    return {"angle_mean": float(angle.mean()), **quantiles}
+    same = angle < SAME_SURFACE
+    return {
+        "angle_mean": float(angle.mean()),
+        "angle_mean_same": float(angle[same].mean()),
+        "other_surface": float(1 - same.mean()),
+        **quantiles,
+    }
+
+
+SAME_SURFACE = 20.0
+"""Degrees beyond which two normals are taken to be of different surfaces of HIGH."""
 
 
 def judge(source: Path, candidates: dict[str, str], stem: Path, views: int) -> dict:
@@ -146,6 +155,9 @@ def judge(source: Path, candidates: dict[str, str], stem: Path, views: int) -> d
 
 def run_row(asset: str, preset: str, steps: int | None, python: str | None, views: int) -> dict:
     """One asset, all stages."""
+    from appearance_opt import backend
+
+    backend.select("cpu")
     OUT.mkdir(parents=True, exist_ok=True)
     stem = OUT / asset
     path = Path(f"{stem}.json")
@@ -175,7 +187,7 @@ def cell(scores: dict) -> str:
 def tables(rows: list[dict]) -> str:
     """Markdown."""
     lines = [
-        "| asset, triangles | Blender | closed form | normals apart (degrees): mean, median, 99 % | time ratio |",
+        "| asset, triangles | Blender | closed form | degrees apart: mean, median, mean < 20, share > 20 | times |",
         "|---|---|---|---|---|",
     ]
     for r in rows:
@@ -183,7 +195,8 @@ def tables(rows: list[dict]) -> str:
         if "blender" not in r:
             continue
         b = r["blender"]
-        degrees = ", ".join(f"{b[k]:.2f}" for k in ("angle_mean", "angle_50", "angle_99"))
+        degrees = ", ".join(f"{b[k]:.2f}" for k in ("angle_mean", "angle_50", "angle_mean_same"))
+        degrees += f", {100 * b['other_surface']:.1f} %"
         ratio = b["seconds"] / r["ours"]["seconds_warm"]["closed form"]
         lines.append(
             f"| {name} | {cell(r['scores']['blender'])} | {cell(r['scores']['closed'])} | {degrees} | {ratio:.1f} |"
