@@ -135,7 +135,7 @@ class BakeJob:
     def run(self, progress: Progress | None, with_report: bool) -> tuple[BakeResult, DivergedError | None]:
         """The closed form, and the fit that starts from it."""
         from appearance_opt.baking.closed_form import bake as bake_closed_form
-        from appearance_opt.jobs.fitting import clean_maps, fit_start
+        from appearance_opt.jobs.fitting import fit_start
         from appearance_opt.jobs.start import Start
 
         baked = bake_closed_form(self.reference, self.mesh, self._settings())
@@ -160,7 +160,8 @@ class BakeJob:
         model, fitted, error = fit_start(
             self.reference, self.sampler, start, options, self.watch, progress=progress, with_report=with_report
         )
-        maps = {**baked.maps, **clean_maps(model, start.known)}
+        # gutters were filled before the fit, which moved those that lookups reach: filling again would undo that
+        maps = {**baked.maps, **model.host_maps()}
         result.fit, result.asset, result.maps = fitted, self._result(maps), self._in_metres(maps)
         if fitted.skipped:
             self.notes.append(f"{fitted.skipped} steps with non-finite gradients were skipped")
