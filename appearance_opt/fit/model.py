@@ -258,14 +258,11 @@ class Model:
             out.update(self.codec.to_maps(self.parameters[TEXELS].value))
         return out
 
-    def touched(self, inside: NDArray[np.bool_], known: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """(size, size) texels whose values mean something: inside a chart, and either known at the start
-        or changed by the fit since."""
-        if self.codec is None or known.any():
-            return inside & known if known.any() else inside
-        texels = np.array(self.parameters[TEXELS].value).reshape(inside.shape[0], inside.shape[1], -1)
-        changed = (texels != self._initial_texels.reshape(texels.shape)).any(axis=-1)
-        return inside & changed
+    def changed(self) -> NDArray[np.bool_]:
+        """(size, size) texels that differ from those of the start. Needs fitted maps."""
+        assert self.codec is not None
+        texels = np.array(self.parameters[TEXELS].value).reshape(self.codec.size, self.codec.size, -1)
+        return (texels != self._initial_texels.reshape(texels.shape)).any(axis=-1)
 
     def values(self) -> dict[str, mi.Float]:
         """Snapshot of all parameters (arrays are never changed in place, so this copies nothing)."""

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from appearance_opt.baking.points import texel_coverage
 from appearance_opt.errors import DivergedError
 from appearance_opt.fit.loop import FitOptions, FitResult, fit
 from appearance_opt.fit.model import Model, Rates
@@ -141,14 +140,13 @@ def effort(psnr: float, likeness: bool) -> tuple[Quality, Rates]:
 
 
 def clean_maps(model: Model, known: NDArray) -> dict:
-    """The model's maps and constants, texels outside of all charts filled from the inside."""
+    """The model's maps and constants. Where nothing was known at the start (``known`` is false everywhere), texels
+    that no view ever touched are filled from those that one did; other starts were filled before the fit, which may
+    since have moved gutters that lookups reach: filling them again would undo that."""
     maps = model.host_maps()
-    out: dict = dict(model.constants)
-    if not maps:
+    out: dict = {**model.constants, **maps}
+    if not maps or known.any() or model.codec is None:
         return out
-    names = list(maps)
-    inside = texel_coverage(model.mesh, len(maps[names[0]]))
-    seen = model.touched(inside, known)
-    stacked = fill(np.stack([maps[n] for n in names], axis=-1), seen)
-    out.update({n: stacked[..., k] for k, n in enumerate(names)})
-    return out
+    names = model.codec.channels
+    stacked = fill(np.stack([maps[n] for n in names], axis=-1), model.changed())
+    return {**out, **{n: stacked[..., k] for k, n in enumerate(names)}}
