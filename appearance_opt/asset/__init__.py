@@ -26,9 +26,16 @@ def load(path: str | Path, *, refine: int = 1, variants: dict[str, str] | None =
         raise InputError(f"{path}: unknown format '{suffix}'; readable are {' '.join(READABLE)}")
     if not path.is_file():
         raise InputError(f"{path}: no such file")
+    import numpy as np
+
     from appearance_opt.asset.validate import repair
 
-    return repair(_read(path, suffix, refine, variants), str(path))
+    try:
+        # numbers that do not fit a float32 become infinite, which ``repair`` refuses by name
+        with np.errstate(over="ignore", invalid="ignore"):
+            return repair(_read(path, suffix, refine, variants), str(path))
+    except MemoryError as error:
+        raise InputError(f"{path}: asks for more memory than there is; it is damaged or too large") from error
 
 
 def _read(path: Path, suffix: str, refine: int, variants: dict[str, str] | None) -> Asset:
