@@ -198,6 +198,18 @@ def test_obj_with_impossible_numbers(tmp_path: Path, text: str, words: str) -> N
         load(tmp_path / "x.obj")
 
 
+def test_binary_usd_that_crashes_usd_itself_is_refused(tmp_path: Path) -> None:
+    """A count among the values, which nothing but USD can check: without the guard this process would end here with
+    a segmentation fault."""
+    save(make_asset(4, 6, 8), tmp_path / "x.usdc")
+    data = bytearray((tmp_path / "x.usdc").read_bytes())
+    assert data[88:96] == struct.pack("<Q", 1)  # length of the first list of the file
+    data[88] = 13
+    (tmp_path / "x.usdc").write_bytes(bytes(data))
+    with pytest.raises(InputError, match=r"reader crashes on it"):
+        load(tmp_path / "x.usdc")
+
+
 def test_binary_usd_with_impossible_counts_is_refused_at_once(whole: Path, tmp_path: Path) -> None:
     data = (whole / "x.usdc").read_bytes()
     (table,) = struct.unpack_from("<q", data, 16)

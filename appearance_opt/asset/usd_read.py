@@ -12,7 +12,7 @@ import numpy as np
 from appearance_opt.asset.paths import read_bytes
 from appearance_opt.asset.subdivide import Polygons, catmull_clark, triangulate
 from appearance_opt.asset.types import Asset, Mesh
-from appearance_opt.asset.usd_crate import check_usd
+from appearance_opt.asset.usd_guard import check_usd
 from appearance_opt.asset.usd_materials import MaterialReader
 from appearance_opt.errors import InputError
 
