@@ -69,7 +69,7 @@ damages = st.one_of(
 
 
 @pytest.mark.parametrize("name", ROOTS)
-@settings(max_examples=60, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=40, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(damage=damages)
 def test_damage_to_any_file_is_refused_or_harmless(whole: Path, name: str, damage: tuple) -> None:
     original = (whole / name).read_bytes()

@@ -83,8 +83,24 @@ def check_writable(path: Path) -> None:
         raise InputError(f"{path}: cannot write '{suffix}' files; choose one of {' '.join(WRITABLE)}")
     if path.is_dir():
         raise InputError(f"{path}: is a folder; name a file in it")
-    folder = path.parent
+    _existing(path.parent, path)
+
+
+def check_folder(folder: Path) -> None:
+    """Raise InputError if files cannot be created in ``folder``, or it cannot be made. Leaves nothing behind."""
+    import tempfile
+
+    there = _existing(Path(folder), Path(folder))
+    try:
+        tempfile.TemporaryFile(dir=there).close()
+    except OSError as error:
+        raise InputError(f"{folder}: nothing can be written there ({error.strerror}); choose another folder") from None
+
+
+def _existing(folder: Path, path: Path) -> Path:
+    """The nearest folder that exists, from ``folder`` upwards. Raises InputError if it is no folder."""
     while not folder.exists() and folder != folder.parent:
         folder = folder.parent
     if not folder.is_dir():
         raise InputError(f"{path}: '{folder}' is not a folder")
+    return folder

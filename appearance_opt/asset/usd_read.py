@@ -39,7 +39,7 @@ def load_usd(path: Path, refine: int = 1, variants: dict[str, str] | None = None
     # USD prints what it warns of; here it becomes notes
     diagnostics = UsdUtils.CoalescingDiagnosticDelegate()
     try:
-        asset = _read_stage(path, subdivision, variants or {})
+        asset = _read_stage(path, refine, variants or {})
     except Tf.ErrorException as error:
         raise InputError(f"{path}: not a readable USD file ({_text(error.__str__)})") from None
     except (KeyError, IndexError, TypeError, ValueError, RuntimeError, OverflowError) as error:
@@ -49,7 +49,7 @@ def load_usd(path: Path, refine: int = 1, variants: dict[str, str] | None = None
     return replace(asset, notes=asset.notes + tuple(f"USD: {text}" for text in dict.fromkeys(warned)))
 
 
-def _read_stage(path: Path, subdivision: int, variants: dict[str, str]) -> Asset:
+def _read_stage(path: Path, refine: int, variants: dict[str, str]) -> Asset:
     from pxr import Usd
 
     stage = Usd.Stage.Open(str(path))
