@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import logging
 import sys
+import time
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -12,6 +13,12 @@ import typer
 
 from appearance_opt import __version__
 from appearance_opt.errors import AppearanceError
+
+BEGAN = time.perf_counter()
+"""Time budgets count from here: importing is part of a run."""
+
+INTERRUPTED = 130
+"""Exit code after a Ctrl-C that left no result: 128 + SIGINT, as shells have it."""
 
 app = typer.Typer(
     add_completion=False,
@@ -26,18 +33,22 @@ def main() -> None:
     """Entry point: every expected failure is one line and exit code 2."""
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s: %(message)s")
     try:
-        app(standalone_mode=False)
+        code = app(standalone_mode=False)
+        if code == INTERRUPTED:  # how typer hands on a Ctrl-C
+            raise KeyboardInterrupt
     except AppearanceError as error:
         _fail(str(error))
     except OSError as error:
         reason = "the disk is full" if error.errno == errno.ENOSPC else (error.strerror or str(error))
         _fail(f"{error.filename or 'file'}: {reason}")
     except KeyboardInterrupt:
-        _fail("interrupted: nothing was written", 130)
+        _fail("interrupted: nothing was written", INTERRUPTED)
     except MemoryError:
         _fail("not enough memory; try a smaller --texture-size, --resolution or --pool")
     except Exception as error:
         # the parser's own errors (typer may bundle its parser, so they are known by what they can do)
+        if type(error).__name__ == "Abort":  # a Ctrl-C, in other versions of typer
+            _fail("interrupted: nothing was written", INTERRUPTED)
         if not hasattr(error, "format_message"):
             raise
         _fail(error.format_message())
@@ -120,16 +131,22 @@ def simplify(
     name = preset or values.pop("preset", None) or "default"
     values.pop("preset", None)
     options = simplify_options(name, **values)
-    from appearance_opt.asset import load
-    from appearance_opt.jobs.simplify import check_paths
     from appearance_opt.jobs.simplify import simplify as run
     from appearance_opt.progress import TerminalProgress
 
-    check_paths(source, out)
-    asset = load(source, refine=options.refine, variants=_variants(variant))
     folder = None if no_report else report or out.with_name(out.stem + ".report")
     with TerminalProgress() as progress:
-        result = run(asset, out, options, report=folder, checkpoint=checkpoint, resume=resume, progress=progress)
+        result = run(
+            source,
+            out,
+            options,
+            report=folder,
+            checkpoint=checkpoint,
+            resume=resume,
+            progress=progress,
+            variants=_variants(variant),
+            began=BEGAN,
+        )
     _print_result(out, result, folder)
 
 
@@ -203,10 +220,11 @@ def bake(
         from appearance_opt.jobs.joint import joint as run_joint
 
         with TerminalProgress() as progress:
-            _print_result(out, run_joint(heavy, low, out, options, report=folder, progress=progress), folder)
+            joined = run_joint(heavy, low, out, options, report=folder, progress=progress, began=BEGAN)
+        _print_result(out, joined, folder)
         return
     with TerminalProgress() as progress:
-        result = run(heavy, low, out, options, report=folder, textures=textures, progress=progress)
+        result = run(heavy, low, out, options, report=folder, textures=textures, progress=progress, began=BEGAN)
     for note in result.notes:
         print(f"note: {note}", file=sys.stderr)
     quality = ""
@@ -215,7 +233,7 @@ def bake(
         quality = f", held-out PSNR {curve[0].psnr:.2f} -> {max(p.psnr for p in curve):.2f} dB"
     missed = f"{100 * result.missed_share:.2f} % of the texels missed"
     print(f"{out}: {','.join(options.maps)}, {missed}, {result.seconds['total']:.1f} s{quality}")
-    if folder is not None:
+    if folder is not None and (folder / "report.html").is_file():
         print(f"report: {folder / 'report.html'}")
 
 
@@ -298,7 +316,7 @@ def _print_result(out: Path, result: Any, folder: Path | None) -> None:
     curve = result.fit.curve
     quality = f", held-out PSNR {curve[0].psnr:.2f} -> {max(p.psnr for p in curve):.2f} dB" if curve else ""
     print(f"{out}: {result.triangles} of {result.source_triangles} triangles, {result.seconds['total']:.1f} s{quality}")
-    if folder is not None:
+    if folder is not None and (folder / "report.html").is_file():
         print(f"report: {folder / 'report.html'}")
 
 

@@ -120,7 +120,8 @@ class CommonOptions:
 class SimplifyOptions(CommonOptions):
     """How to simplify.
 
-    ``triangles`` or ``ratio``: the budget (exactly one). ``init``: "decimate", "sphere", or a file with a start.
+    ``triangles`` or ``ratio``: the budget (exactly one; neither is needed where
+    ``init`` is a file). ``init``: "decimate", "sphere", or a file with a start.
     ``reallocate``: rounds in which triangles are moved to where the image error of the decimated mesh is.
     ``relative``: the Laplacian keeps the start's shape (a sphere start uses the absolute one unless told
     otherwise). ``keep_hidden``: keep geometry that no outside view sees. ``displacement``: fit a displacement map
@@ -148,7 +149,7 @@ class SimplifyOptions(CommonOptions):
         if given != 1 and (self.init in INITS or given):  # a file to start from brings its own triangles
             raise InputError("give either --triangles N or --ratio R")
         if self.triangles is not None:
-            _require(self.triangles >= 4, "triangles", self.triangles, "at least 4")
+            _require(self.triangles >= 1, "triangles", self.triangles, "at least 1")
         if self.ratio is not None:
             _require(0 < self.ratio <= 1, "ratio", self.ratio, "above 0 and at most 1")
         super().__post_init__()

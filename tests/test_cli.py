@@ -38,7 +38,7 @@ def test_simplify_and_compare_as_a_user_would(ball: Asset, tmp_path: Path) -> No
     ("arguments", "words"),
     [
         (["simplify", "absent.glb", "--triangles", "10", "--out", "x.glb"], "absent.glb: no such file"),
-        (["simplify", "ball.glb", "--triangles", "0", "--out", "x.glb"], "at least 4"),
+        (["simplify", "ball.glb", "--triangles", "0", "--out", "x.glb"], "at least 1"),
         (["simplify", "ball.glb", "--out", "x.glb"], "--triangles N or --ratio R"),
         (["simplify", "ball.glb", "--triangles", "99999", "--out", "x.glb"], "has only 2208 triangles"),
         (["simplify", "ball.glb", "--triangles", "10", "--out", "ball.glb"], "is the input itself"),

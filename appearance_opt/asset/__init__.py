@@ -26,9 +26,16 @@ def load(path: str | Path, *, refine: int = 1, variants: dict[str, str] | None =
         raise InputError(f"{path}: unknown format '{suffix}'; readable are {' '.join(READABLE)}")
     if not path.is_file():
         raise InputError(f"{path}: no such file")
+    import numpy as np
+
     from appearance_opt.asset.validate import repair
 
-    return repair(_read(path, suffix, refine, variants), str(path))
+    try:
+        # numbers that do not fit a float32 become infinite, which ``repair`` refuses by name
+        with np.errstate(over="ignore", invalid="ignore"):
+            return repair(_read(path, suffix, refine, variants), str(path))
+    except MemoryError as error:
+        raise InputError(f"{path}: asks for more memory than there is; it is damaged or too large") from error
 
 
 def _read(path: Path, suffix: str, refine: int, variants: dict[str, str] | None) -> Asset:
@@ -76,8 +83,24 @@ def check_writable(path: Path) -> None:
         raise InputError(f"{path}: cannot write '{suffix}' files; choose one of {' '.join(WRITABLE)}")
     if path.is_dir():
         raise InputError(f"{path}: is a folder; name a file in it")
-    folder = path.parent
+    _existing(path.parent, path)
+
+
+def check_folder(folder: Path) -> None:
+    """Raise InputError if files cannot be created in ``folder``, or it cannot be made. Leaves nothing behind."""
+    import tempfile
+
+    there = _existing(Path(folder), Path(folder))
+    try:
+        tempfile.TemporaryFile(dir=there).close()
+    except OSError as error:
+        raise InputError(f"{folder}: nothing can be written there ({error.strerror}); choose another folder") from None
+
+
+def _existing(folder: Path, path: Path) -> Path:
+    """The nearest folder that exists, from ``folder`` upwards. Raises InputError if it is no folder."""
     while not folder.exists() and folder != folder.parent:
         folder = folder.parent
     if not folder.is_dir():
         raise InputError(f"{path}: '{folder}' is not a folder")
+    return folder

@@ -19,6 +19,9 @@ if TYPE_CHECKING:
 
 COMPONENTS = {5120: np.int8, 5121: np.uint8, 5122: np.int16, 5123: np.uint16, 5125: np.uint32, 5126: np.float32}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
+MAX_ZEROS = 1 << 24
+"""Most elements of an accessor without data, which stands for zeros: a few bytes of JSON must not ask for more
+memory than there is."""
 _MAGIC, _JSON, _BIN = 0x46546C67, 0x4E4F534A, 0x004E4942
 
 
@@ -31,7 +34,7 @@ class Document:
         text, self._binary = _chunks(data, self.path) if data[:4] == b"glTF" else (data, None)
         try:
             self.json: dict[str, Any] = json.loads(text)
-        except ValueError as error:
+        except (ValueError, RecursionError) as error:
             raise InputError(f"{path}: not a glTF file, or cut short ({error})") from None
         if not isinstance(self.json, dict) or "asset" not in self.json:
             raise InputError(f"{path}: not a glTF file (no 'asset' object)")
@@ -67,9 +70,12 @@ class Document:
         """(count, width) array: floats for float and normalized types, integers otherwise."""
         a = self.items("accessors")[index]
         kind, width, count = np.dtype(COMPONENTS[a["componentType"]]), WIDTHS[a["type"]], a["count"]
-        out = np.zeros((count, width), kind)
         if "bufferView" in a:
             out = self._elements(a["bufferView"], a.get("byteOffset", 0), kind, width, count)
+        elif count > MAX_ZEROS:
+            raise InputError(f"{self.path}: accessor {index} has {count} elements but no data; the file is damaged")
+        else:
+            out = np.zeros((count, width), kind)
         if "sparse" in a:
             s = a["sparse"]
             at = s["indices"]

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import struct
 import tempfile
+import zlib
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from appearance_opt.asset.paths import read_bytes
 from appearance_opt.errors import InputError
 
 if TYPE_CHECKING:
@@ -25,17 +28,40 @@ def decode(data: bytes, name: str) -> NDArray:
     if not data:
         raise InputError(f"{name}: the image is empty")
     # the Python bindings of OpenImageIO read from and write to named files only
+    suffix = _suffix(data, name)
+    if suffix == ".png":
+        check_png(data, name)
     with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / ("image" + _suffix(data, name))
+        path = Path(folder) / ("image" + suffix)
         path.write_bytes(data)
         return _open(path, name)
 
 
 def read(path: Path) -> NDArray:
     """Pixels of an image file. Raises InputError naming the file."""
-    if not Path(path).is_file():
-        raise InputError(f"{path}: no such image file")
+    data = read_bytes(path)
+    if data.startswith(b"\x89PNG"):
+        check_png(data, str(path))
     return _open(Path(path), str(path))
+
+
+def check_png(data: bytes, name: str) -> None:
+    """Raise InputError if a PNG file is cut short or a chunk's checksum is wrong (PNG specification, 5.3).
+
+    libpng, asked to read such a file, prints to standard error before it fails.
+    """
+    offset = 8
+    while offset + 12 <= len(data):
+        length, kind = struct.unpack_from(">I4s", data, offset)
+        end = offset + 12 + length
+        if end > len(data):
+            break
+        if zlib.crc32(data[offset + 4 : end - 4]) != struct.unpack_from(">I", data, end - 4)[0]:
+            raise InputError(f"{name}: the image is damaged (a wrong checksum); export it again")
+        if kind == b"IEND":
+            return
+        offset = end
+    raise InputError(f"{name}: the image is damaged (cut short); export it again")
 
 
 def _open(path: Path, name: str) -> NDArray:
@@ -102,7 +128,8 @@ def _encode(pixels: NDArray, spec, suffix: str, attributes: Mapping[str, float |
         out = oiio.ImageOutput.create(str(path))
         if out is None or not out.open(str(path), spec) or not out.write_image(pixels):
             raise OSError(f"cannot encode a {suffix} image: {oiio.geterror()}")
-        out.close()
+        if not out.close():  # what is buffered meets a full disk only now
+            raise OSError(f"cannot encode a {suffix} image: {out.geterror()}")
         return path.read_bytes()
 
 

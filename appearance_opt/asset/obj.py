@@ -24,6 +24,9 @@ _MAP_OPTIONS = {
 }  # fmt: skip
 """Options of map statements and how many values follow them."""
 
+MAX_INDEX = 2**31 - 1
+"""Largest index of a face's corner (they are kept in 32 bits)."""
+
 
 def load_obj(path: Path) -> Asset:
     """Read an OBJ file and its materials. Raises InputError."""
@@ -80,7 +83,7 @@ class _Parser:
             if part:
                 i = int(part)
                 out[k] = i - 1 if i > 0 else counts[k] + i
-                if i == 0 or out[k] < 0:
+                if i == 0 or out[k] < 0 or i > MAX_INDEX:
                     raise ValueError
         if out[0] < 0:
             raise ValueError
@@ -137,8 +140,8 @@ def load_mtl(path: Path, notes: list[str]) -> dict[str, Material]:
     for name, values in statements.items():
         try:
             out[name] = _material(name, values, path, notes)
-        except ValueError:
-            raise InputError(f"{path}: a value of material '{name}' is not a number") from None
+        except (ValueError, IndexError):
+            raise InputError(f"{path}: a value of material '{name}' is missing or not a number") from None
     return out
 
 

@@ -22,10 +22,14 @@ def resolve(reference: str, owner: Path, percent_encoded: bool = False) -> Path:
     if "\0" in text or (urlparse(text).scheme and len(urlparse(text).scheme) > 1):
         raise InputError(f"{owner}: refers to '{reference}', which is not a file beside it")
     root = owner.resolve().parent
-    path = (root / text.replace("\\", "/")).resolve()
+    try:
+        path = (root / text.replace("\\", "/")).resolve()
+        exists = path.is_file()
+    except (OSError, ValueError, RuntimeError):  # names too long for the file system, loops of links
+        raise InputError(f"{owner}: refers to '{reference[:80]}', which is no file name") from None
     if not path.is_relative_to(root):
         raise InputError(f"{owner}: refers to '{reference}' outside its own folder; copy the file beside it")
-    if not path.is_file():
+    if not exists:
         raise InputError(f"{owner}: refers to '{reference}', which does not exist")
     return path
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -10,10 +12,13 @@ import numpy as np
 from appearance_opt.asset.paths import read_bytes
 from appearance_opt.asset.subdivide import Polygons, catmull_clark, triangulate
 from appearance_opt.asset.types import Asset, Mesh
+from appearance_opt.asset.usd_guard import check_usd
 from appearance_opt.asset.usd_materials import MaterialReader
 from appearance_opt.errors import InputError
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from numpy.typing import NDArray
 
 _TO_Y_UP = {
@@ -27,17 +32,30 @@ def load_usd(path: Path, refine: int = 1, variants: dict[str, str] | None = None
     """Read a stage at its default time, variants at their selection (or as ``variants`` says: set name ->
     variant, on the default prim). Catmull-Clark and Loop meshes are refined ``refine`` times. Raises
     InputError."""
-    from pxr import Tf, Usd
+    from pxr import Tf, UsdUtils
 
     path = Path(path)
-    read_bytes(path)
+    check_usd(read_bytes(path), path)
+    # USD prints what it warns of; here it becomes notes
+    diagnostics = UsdUtils.CoalescingDiagnosticDelegate()
     try:
-        stage = Usd.Stage.Open(str(path))
+        asset = _read_stage(path, refine, variants or {})
     except Tf.ErrorException as error:
-        raise InputError(f"{path}: not a readable USD file ({_first_line(error)})") from None
+        raise InputError(f"{path}: not a readable USD file ({_text(error.__str__)})") from None
+    except (KeyError, IndexError, TypeError, ValueError, RuntimeError, OverflowError) as error:
+        raise InputError(f"{path}: the USD structure is broken ({type(error).__name__})") from error
+    finally:
+        warned = [_text(partial(getattr, w, "commentary")) for w in diagnostics.TakeUncoalescedDiagnostics()]
+    return replace(asset, notes=asset.notes + tuple(f"USD: {text}" for text in dict.fromkeys(warned)))
+
+
+def _read_stage(path: Path, refine: int, variants: dict[str, str]) -> Asset:
+    from pxr import Usd
+
+    stage = Usd.Stage.Open(str(path))
     if stage is None:
         raise InputError(f"{path}: not a readable USD file")
-    _select(stage, variants or {}, path)
+    _select(stage, variants, path)
     _refuse_escapes(stage, path)
     return _Reader(stage, path, refine).asset()
 
@@ -209,5 +227,9 @@ def _expand(value: Any, how: str, polygons: Polygons, width: int) -> tuple[NDArr
     return None
 
 
-def _first_line(error: Exception) -> str:
-    return " ".join(str(error).split())[:120]
+def _text(get: Callable[[], str]) -> str:
+    """What USD says, in one line. It may quote bytes that are no text."""
+    try:
+        return " ".join(get().split())[:160]
+    except UnicodeDecodeError:
+        return "it is not text"

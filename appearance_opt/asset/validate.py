@@ -14,6 +14,14 @@ from appearance_opt.errors import InputError
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from appearance_opt.asset.types import Material
+
+MAX_UV = 65536.0
+"""Texture coordinates farther from the unit square than this have no fraction left in single precision that
+could address a texel."""
+
+_WIDTHS = {"positions": 3, "normals": 3, "uvs": 2, "tangents": 4, "colors": 3}
+
 
 @dataclass(frozen=True)
 class Validation:
@@ -82,13 +90,18 @@ def repair(asset: Asset, source: str) -> Asset:
     """The asset with harmless faults mended, and a note for each kind. ``source`` names it in errors.
 
     Dropped: degenerate faces, unreferenced vertices, empty meshes. Recomputed: normals that are not
-    finite or zero. Raises InputError for positions or texture coordinates that are not finite, indices
-    out of range, and when no face is left.
+    finite or zero. Clamped: texture coordinates, colours and factors beyond their range. Raises InputError
+    for positions, texture coordinates or factors that are not finite, attributes that do not fit the
+    positions, indices out of range, and when no face is left.
     """
     notes: list[str] = []
     meshes = [m for m in (_repair(mesh, source, notes) for mesh in asset.meshes) if len(m.faces)]
     if not meshes:
         raise InputError(f"{source}: there are no triangles in it")
+    # meshes that shared a material go on sharing it
+    materials = {id(m.material): m.material for m in meshes}
+    mended = {key: repair_material(m, source, notes) for key, m in materials.items()}
+    meshes = [replace(m, material=mended[id(m.material)]) for m in meshes]
     return replace(asset, meshes=tuple(meshes), notes=asset.notes + tuple(notes))
 
 
@@ -99,6 +112,13 @@ def _repair(mesh: Mesh, source: str, notes: list[str]) -> Mesh:
             f"{source}, mesh '{mesh.name}': {bad} faces refer to vertices that do not exist "
             f"(there are {len(mesh.positions)}); export it again"
         )
+    for name, width in _WIDTHS.items():
+        values = getattr(mesh, name)
+        if values is not None and values.shape != (len(mesh.positions), width):
+            raise InputError(
+                f"{source}, mesh '{mesh.name}': its {name} are {values.shape} numbers for {len(mesh.positions)} "
+                "positions; export it again"
+            )
     used = np.unique(mesh.faces)
     broken = int((~np.isfinite(mesh.positions[used])).any(axis=1).sum())
     if broken:
@@ -115,7 +135,40 @@ def _repair(mesh: Mesh, source: str, notes: list[str]) -> Mesh:
     if len(used) < len(mesh.positions):
         notes.append(f"mesh '{mesh.name}': {len(mesh.positions) - len(used)} unreferenced vertices dropped")
         mesh = _compacted(mesh, used)
-    return _repair_normals(mesh, notes)
+    return _repair_normals(_repair_ranges(mesh, notes), notes)
+
+
+def _repair_ranges(mesh: Mesh, notes: list[str]) -> Mesh:
+    """Texture coordinates and colours brought to where they mean something."""
+    limits: dict[str, tuple[float, float]] = {"uvs": (-MAX_UV, MAX_UV), "colors": (0.0, 1.0)}
+    for name, (low, high) in limits.items():
+        values = getattr(mesh, name)
+        if values is not None and len(values) and (values.min() < low or values.max() > high):
+            notes.append(f"mesh '{mesh.name}': {name} outside of {low:g} to {high:g} clamped")
+            mesh = replace(mesh, **{name: np.clip(values, low, high)})
+    return mesh
+
+
+def repair_material(material: Material, source: str, notes: list[str]) -> Material:
+    """The material with factors and float texels within [0, 1], and a note if they were not. Raises
+    InputError for factors that are not numbers."""
+    factors = (*material.base_color, material.roughness, material.metalness)
+    if not np.isfinite((*factors, material.normal_scale)).all():
+        raise InputError(
+            f"{source}, material '{material.name}': a factor is NaN or infinite; set it to a number from 0 to 1"
+        )
+    if min(factors) < 0 or max(factors) > 1:
+        notes.append(f"material '{material.name}': factors outside of 0 to 1 clamped")
+        r, g, b, roughness, metalness = (min(max(f, 0.0), 1.0) for f in factors)
+        material = replace(material, base_color=(r, g, b), roughness=roughness, metalness=metalness)
+    for name in ("base_color_texture", "orm_texture", "normal_texture"):
+        texture = getattr(material, name)
+        if texture is None or texture.pixels.dtype.kind != "f":
+            continue
+        if texture.pixels.min() < 0 or texture.pixels.max() > 1:
+            notes.append(f"material '{material.name}': values of its {name} outside of 0 to 1 clamped")
+            material = replace(material, **{name: replace(texture, pixels=np.clip(texture.pixels, 0, 1))})
+    return material
 
 
 def _repair_normals(mesh: Mesh, notes: list[str]) -> Mesh:

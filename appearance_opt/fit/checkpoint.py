@@ -6,6 +6,7 @@ import logging
 import os
 import tempfile
 import time
+import zipfile
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -99,7 +100,8 @@ class Checkpointer:
             log.info("no checkpoint in %s: starting from the beginning", self.path.parent)
             return False
         try:
-            with np.load(self.path) as file:
+            # opened here: NumPy leaves its own handle open when the archive is cut short
+            with self.path.open("rb") as stored, np.load(stored) as file:
                 arrays = {k: file[k] for k in file.files}
             if str(arrays["fingerprint"]) != self.fingerprint:
                 raise InputError(
@@ -107,7 +109,7 @@ class Checkpointer:
                     "resume with the same ones, or choose another --checkpoint folder"
                 )
             _fill(model, state, arrays)
-        except (OSError, KeyError, ValueError, EOFError) as error:
+        except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
             raise InputError(f"{self.path}: not a usable checkpoint ({error}); delete it to start anew") from error
         model.update_scene()
         return True

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Protocol
 
@@ -107,10 +108,11 @@ def fit(
     except KeyboardInterrupt:
         log.warning("interrupted at step %d: the best state so far is kept", run.state.iteration)
         run.result.interrupted = True
+        model.update_scene()  # the step that was interrupted may have moved vertices already
     except DivergedError:
         run.finish(look=False)
         raise
-    run.finish(look=not run.result.interrupted)
+    run.finish(look=True)
     return run.result
 
 
@@ -140,7 +142,9 @@ class _Run:
         self.clock = Clock(options.steps, options.seconds, self.state.seconds)
         self.bad_steps = 0
         self.psnr = self.state.best_psnr
-        self.next_look = self.clock.progress(self.state.iteration) + options.validate_every
+        # looks happen at the same iterations whether a run was resumed or not
+        looks = math.floor(self.clock.progress(self.state.iteration) / options.validate_every)
+        self.next_look = (looks + 1) * options.validate_every
 
     def advance(self) -> None:
         """One iteration."""

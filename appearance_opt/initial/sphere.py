@@ -8,6 +8,9 @@ from numpy.typing import NDArray
 from appearance_opt.initial.atlas import unwrap
 from appearance_opt.latent.latent import LatentMesh
 
+SMALLEST = 12
+"""Triangles of the coarsest sphere, a cube."""
+
 
 def sphere(triangles: int, centre: tuple[float, float, float], radius: float, size: int) -> LatentMesh:
     """A sphere of at most ``triangles`` triangles, evenly spread: a cube-sphere of six n x n grids, 12 n^2

@@ -61,6 +61,7 @@ def bake(
     report: str | Path | None = None,
     textures: str | Path | None = None,
     progress: Progress | None = None,
+    began: float | None = None,
 ) -> BakeResult:
     """Bake ``high`` to ``low`` (paths or assets) and write LOW with its new maps to ``out`` (None: do not write).
 
@@ -68,13 +69,12 @@ def bake(
     maps for which the format of ``out`` has no place are always written, by default to ``<out's stem>_maps``.
     Raises AppearanceError.
     """
-    from appearance_opt.jobs.fitting import Stopwatch
+    from appearance_opt.jobs.fitting import Stopwatch, optional_report
     from appearance_opt.jobs.simplify import check_paths
 
-    watch = Stopwatch()
-    if out is not None:
-        for source in (high, low):
-            check_paths(Path(source) if isinstance(source, (str, Path)) else None, Path(out))
+    watch = Stopwatch(began)
+    for source in (high, low):
+        check_paths(source, out, report)
     heavy = load(high, refine=options.refine) if isinstance(high, (str, Path)) else high
     light = load(low, refine=options.refine) if isinstance(low, (str, Path)) else low
     watch.lap("load")
@@ -90,7 +90,8 @@ def bake(
         from appearance_opt.jobs.report import write_bake_report
 
         result.seconds = dict(watch.stages)
-        write_bake_report(Path(report), run.high, result, run.sampler, run.frame, options)
+        with optional_report(result.notes):
+            write_bake_report(Path(report), run.high, result, run.sampler, run.frame, options)
         watch.lap("report")
     result.seconds = {**watch.stages, "total": watch.total}
     return result

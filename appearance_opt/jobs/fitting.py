@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import logging
 import time
+from contextlib import contextmanager
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -18,6 +20,8 @@ from appearance_opt.reference.pool import ReferencePool
 from appearance_opt.render.gradient import Quality
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from numpy.typing import NDArray
 
     from appearance_opt.config import CommonOptions
@@ -26,6 +30,8 @@ if TYPE_CHECKING:
     from appearance_opt.jobs.start import Start
     from appearance_opt.reference.base import Reference
     from appearance_opt.views import ViewSampler
+
+log = logging.getLogger(__name__)
 
 VALIDATION_VIEWS = 8
 
@@ -44,10 +50,10 @@ REPORT_SECONDS = 5.0
 
 
 class Stopwatch:
-    """Seconds by stage."""
+    """Seconds by stage. ``began``: ``time.perf_counter()`` of the start, by default now."""
 
-    def __init__(self) -> None:
-        self.began = self._last = time.perf_counter()
+    def __init__(self, began: float | None = None) -> None:
+        self.began = self._last = time.perf_counter() if began is None else began
         self.stages: dict[str, float] = {}
 
     def lap(self, stage: str) -> None:
@@ -60,6 +66,15 @@ class Stopwatch:
     def total(self) -> float:
         """Seconds since the start."""
         return time.perf_counter() - self.began
+
+
+@contextmanager
+def optional_report(notes: list[str]) -> Iterator[None]:
+    """A Ctrl-C while a report is made ends the report alone: the result is written already."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        notes.append("interrupted while the report was made: the result is complete, the report is missing")
 
 
 def fit_start(
@@ -94,6 +109,13 @@ def fit_start(
     quality = replace(quality, point_width=width)
     watch.lap("set-up")
     seconds = seconds_left(o, watch, with_report)
+    if seconds == 0.0:
+        log.warning(
+            "--budget %.0f s holds no more than set-up (%.0f s so far) and writing: the result is the start, "
+            "without a fit",
+            o.budget,
+            watch.total,
+        )
     fit_options = FitOptions(
         steps=o.steps if seconds is not None or o.steps is not None else 1000,
         seconds=seconds,

@@ -28,18 +28,18 @@ def joint(
     *,
     report: str | Path | None = None,
     progress: Progress | None = None,
+    began: float | None = None,
 ) -> SimplifyResult:
     """Fit base shape, displacement, normals and material of ``low`` to ``high`` and write the result to ``out``
     (None: do not write). LOW keeps its topology and its texture coordinates; each kind of detail goes where it
     is represented best. Raises AppearanceError."""
     from appearance_opt.jobs.bake import BakeJob
     from appearance_opt.jobs.displaced import require_memory, write_companion, write_levels
-    from appearance_opt.jobs.fitting import Stopwatch
+    from appearance_opt.jobs.fitting import Stopwatch, optional_report
 
-    watch = Stopwatch()
-    if out is not None:
-        for source in (high, low):
-            check_paths(Path(source) if isinstance(source, (str, Path)) else None, Path(out))
+    watch = Stopwatch(began)
+    for source in (high, low):
+        check_paths(source, out, report)
     heavy = load(high, refine=options.refine) if isinstance(high, (str, Path)) else high
     light = load(low, refine=options.refine) if isinstance(low, (str, Path)) else low
     require_memory(light.triangle_count, options)
@@ -58,7 +58,8 @@ def joint(
         from appearance_opt.jobs.report import write_simplify_report
 
         result.seconds = dict(watch.stages)
-        write_simplify_report(Path(report), job.high, result, job.sampler, job.frame, options)
+        with optional_report(result.notes):
+            write_simplify_report(Path(report), job.high, result, job.sampler, job.frame, options)
         watch.lap("report")
     result.seconds = {**watch.stages, "total": watch.total}
     return result

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from appearance_opt import backend
-from appearance_opt.asset import check_writable, load, save
+from appearance_opt.asset import check_folder, check_writable, load, save
 from appearance_opt.config import SimplifyOptions, as_dict, with_values
 from appearance_opt.errors import DivergedError, InputError
 
@@ -62,20 +62,22 @@ def simplify(
     checkpoint: str | Path | None = None,
     resume: bool = False,
     progress: Progress | None = None,
+    variants: dict[str, str] | None = None,
+    began: float | None = None,
 ) -> SimplifyResult:
     """Simplify ``source`` (a path or an asset) and write the result to ``out`` (None: do not write).
 
     ``report``: folder for pictures, metrics and report.html. ``checkpoint``: folder in which the state is kept
-    every few seconds; with ``resume`` a run goes on from there. Ctrl-C ends the fit early and still
-    writes the best state so far. Raises AppearanceError.
+    every few seconds; with ``resume`` a run goes on from there. ``variants``: USD variant selections. ``began``:
+    ``time.perf_counter()`` at which the time budget began, if before this call. Ctrl-C ends the fit early and still
+    writes the best state so far; once the result is written it ends the report. Raises AppearanceError.
     """
     from appearance_opt.jobs.displaced import write_companion, write_levels
-    from appearance_opt.jobs.fitting import Stopwatch
+    from appearance_opt.jobs.fitting import Stopwatch, optional_report
 
-    watch = Stopwatch()
-    if out is not None:
-        check_paths(Path(source) if isinstance(source, (str, Path)) else None, Path(out))
-    asset = load(source, refine=options.refine) if isinstance(source, (str, Path)) else source
+    watch = Stopwatch(began)
+    check_paths(source, out, report, checkpoint)
+    asset = load(source, refine=options.refine, variants=variants) if isinstance(source, (str, Path)) else source
     watch.lap("load")
     backend.select(options.device)
     run = _Job(asset, options, watch, progress, _checkpointer(asset, options, checkpoint, resume), report is not None)
@@ -93,18 +95,28 @@ def simplify(
         from appearance_opt.jobs.report import write_simplify_report
 
         result.seconds = dict(watch.stages)
-
-        write_simplify_report(Path(report), asset, result, run.sampler, run.frame, options)
+        with optional_report(result.notes):
+            write_simplify_report(Path(report), asset, result, run.sampler, run.frame, options)
         watch.lap("report")
     result.seconds = {**watch.stages, "total": watch.total}
     return result
 
 
-def check_paths(source: Path | None, out: Path) -> None:
-    """Raise InputError before any work if the result could not be written, or would replace the input."""
-    check_writable(out)
-    if source is not None and out.resolve() == source.resolve():
-        raise InputError(f"{out}: is the input itself, which is never changed; choose another name")
+def check_paths(
+    source: str | Path | Asset | None,
+    out: str | Path | None,
+    report: str | Path | None = None,
+    checkpoint: str | Path | None = None,
+) -> None:
+    """Raise InputError before any work if results could not be written, or would replace the input."""
+    if out is not None:
+        check_writable(Path(out))
+        check_folder(Path(out).parent)
+        if isinstance(source, (str, Path)) and Path(out).resolve() == Path(source).resolve():
+            raise InputError(f"{out}: is the input itself, which is never changed; choose another name")
+    for folder in (report, checkpoint):
+        if folder is not None:
+            check_folder(Path(folder))
 
 
 class _Job:
@@ -249,4 +261,9 @@ def _checkpointer(
     for mesh in asset.meshes:
         digest.update(mesh.positions.tobytes())
         digest.update(mesh.faces.tobytes())
+        digest.update(b"" if mesh.uvs is None else mesh.uvs.tobytes())
+    for material in {id(m.material): m.material for m in asset.meshes}.values():
+        digest.update(repr((material.base_color, material.roughness, material.metalness)).encode())
+        for texture in (material.base_color_texture, material.orm_texture, material.normal_texture):
+            digest.update(b"" if texture is None else texture.pixels.tobytes())
     return Checkpointer(Path(folder), digest.hexdigest(), resume, CHECKPOINT_SECONDS)

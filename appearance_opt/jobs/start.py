@@ -13,6 +13,7 @@ from appearance_opt.errors import InputError
 from appearance_opt.initial.atlas import unwrap
 from appearance_opt.initial.decimate import decimate
 from appearance_opt.initial.reallocate import StartError, weights
+from appearance_opt.initial.sphere import SMALLEST as SMALLEST_SPHERE
 from appearance_opt.initial.sphere import random_maps, sphere
 from appearance_opt.initial.transfer import transfer
 from appearance_opt.initial.visibility import importance, pixel_counts
@@ -59,7 +60,7 @@ def budget(options: SimplifyOptions, available: int) -> int:
     count = options.triangles
     if count is None:
         assert options.ratio is not None
-        count = max(4, round(options.ratio * available))
+        count = min(max(4, round(options.ratio * available)), available)
     if count > available:
         raise InputError(f"--triangles {count}: the input has only {available} triangles; ask for fewer")
     require_memory(count, options)
@@ -70,6 +71,8 @@ def make_start(reference: MeshReference, options: SimplifyOptions, sampler: View
     """Sphere, decimated reference, or the mesh of another file (in the reference's frame)."""
     size = options.texture_size
     if options.init == "sphere":
+        if triangles < SMALLEST_SPHERE:
+            raise InputError(f"--init sphere needs at least {SMALLEST_SPHERE} triangles, not {triangles}")
         mesh = sphere(triangles, sampler.centre, 0.6 * sampler.radius, size)
         maps = random_maps(size, options.seed, options.normal_map and "normal" in options.fit)
         known = np.zeros((size, size), bool)
@@ -140,11 +143,15 @@ def transferred(reference: MeshReference, mesh: LatentMesh, options: SimplifyOpt
 def loaded_start(
     path: Path, to_fit_frame: tuple[NDArray, float], reference: MeshReference, options: SimplifyOptions
 ) -> Start:
-    """The mesh of a file as a start: its shape is kept, atlas and maps are made anew."""
+    """The mesh of a file as a start: its shape is kept, atlas and maps are made anew. Raises InputError when it
+    has more triangles than were asked for."""
     from appearance_opt.asset import load
     from appearance_opt.asset.normals import weld
 
     asset = load(path, refine=options.refine)
+    most = None if options.triangles is None and options.ratio is None else budget(options, len(reference.merged.faces))
+    if most is not None and asset.triangle_count > most:
+        raise InputError(f"--init {path}: has {asset.triangle_count} triangles, more than the {most} asked for")
     offsets = np.cumsum([0] + [len(m.positions) for m in asset.meshes[:-1]])
     p = np.concatenate([m.positions for m in asset.meshes]).astype(np.float64)
     f = np.concatenate([m.faces + o for m, o in zip(asset.meshes, offsets, strict=True)])

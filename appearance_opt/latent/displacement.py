@@ -16,6 +16,7 @@ import numpy as np
 from appearance_opt.latent import mesh_ops
 from appearance_opt.latent.latent import LatentMesh, LatentTopology, corners_of
 from appearance_opt.latent.subdivision import tessellate
+from appearance_opt.render.math import unit
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -70,7 +71,7 @@ class Tessellator:
             return mi.Point3f(*self._mix(rows, 0)), mi.Vector3f(0)
         base = mesh_ops.packed_vertices(positions, mesh_ops.vertex_normals(positions, self._base))
         rows = [self._row(base, k, 8) for k in range(3)]
-        return mi.Point3f(*self._mix(rows, 0)), mesh_ops.unit(mi.Vector3f(*self._mix(rows, 4)))
+        return mi.Point3f(*self._mix(rows, 0)), unit(mi.Vector3f(*self._mix(rows, 4)))
 
     def _row(self, buffer: mi.Float, parent: int, channels: int) -> mi.ArrayXf:
         # Expand: hundreds of vertices hang on one base vertex, whose gradient atomics would serialise

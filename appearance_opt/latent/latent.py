@@ -111,7 +111,7 @@ def handedness(mesh: LatentMesh) -> NDArray[np.float32]:
 
 
 def local_edge_length(positions: NDArray, faces: NDArray) -> NDArray[np.float32]:
-    """(V,) mean length of the edges around each vertex; the mesh's mean for vertices without one."""
+    """(V,) mean length of the edges around each vertex, positive; the mesh's mean for vertices without one."""
     length = np.zeros(len(positions))
     count = np.zeros(len(positions))
     for a, b in ((0, 1), (1, 2), (2, 0)):
@@ -122,4 +122,6 @@ def local_edge_length(positions: NDArray, faces: NDArray) -> NDArray[np.float32]
             count += np.bincount(k, minlength=len(positions))
     used = count > 0
     mean = length[used].sum() / max(count[used].sum(), 1)
-    return np.where(used, length / np.maximum(count, 1), mean).astype(np.float32)
+    # divisors elsewhere: corners that all lie at one place still get a length
+    floor = max(1e-6 * mean, 1e-12)
+    return np.maximum(np.where(used, length / np.maximum(count, 1), mean), floor).astype(np.float32)

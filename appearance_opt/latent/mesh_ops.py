@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from appearance_opt.render.math import at_least
+from appearance_opt.render.math import at_least, unit
 
 TINY = 1e-20
 
@@ -82,13 +82,6 @@ def interleave(*columns: mi.Float) -> mi.Float:
 
 def _in_plane(v: mi.Vector3f, n: mi.Vector3f) -> mi.Vector3f:
     return v - n * dr.dot(n, v)
-
-
-def unit(v: mi.Vector3f) -> mi.Vector3f:
-    """v / |v|, and zero with a zero gradient where v is (nearly) zero."""
-    squared = dr.squared_norm(v)
-    ok = squared > 1e-30
-    return dr.select(ok, v * dr.rsqrt(dr.select(ok, squared, 1)), 0)
 
 
 def _angle(a: mi.Vector3f, b: mi.Vector3f) -> mi.Float:

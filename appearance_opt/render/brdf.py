@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from appearance_opt.render.math import at_least, clamp
+from appearance_opt.render.math import at_least, clamp, unit
 
 ROUGHNESS_FLOOR = 0.08
 """Smallest roughness (GGX alpha = roughness^2), after the paper: below it a highlight of a point light
@@ -42,7 +42,7 @@ def reflect(material: MaterialSample, n: mi.Vector3f, v: mi.Vector3f, l: mi.Vect
     if material.gamma is not None:
         f0 *= 1 - material.gamma
     diffuse = material.base_color * ((1 - material.metalness) * dr.inv_pi)
-    h = dr.normalize(l + v)
+    h = unit(l + v)  # zero where the light is exactly behind: n.l is then below zero
     nl = at_least(dr.dot(n, l), 0)
     nv = at_least(dr.dot(n, v), 1e-3)
     nh = clamp(dr.dot(n, h), 0, 1)

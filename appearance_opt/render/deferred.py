@@ -15,11 +15,16 @@ from scipy.ndimage import maximum_filter, minimum_filter
 
 from appearance_opt.render import brdf, material, rays
 from appearance_opt.render.material import MaterialMaps
+from appearance_opt.render.math import at_least
 from appearance_opt.render.rays import Samples
 from appearance_opt.render.surface import Surface, interpolate
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
+
+NEAREST_LIGHT = 1e-3
+"""Distance below which a light gets no brighter (the object's radius is 1 in a fit): a point light that touches a
+surface is infinitely bright there."""
 
 
 class Grid:
@@ -53,7 +58,7 @@ def shade(
     sample = material.evaluate(maps, hit)
     normal = material.shading_normal(hit, sample)
     to_light = camera.light - hit.position
-    squared_distance = dr.squared_norm(to_light)
+    squared_distance = at_least(dr.squared_norm(to_light), NEAREST_LIGHT**2)
     to_light *= dr.rsqrt(squared_distance)
     irradiance = camera.intensity / squared_distance
     return brdf.reflect(sample, normal, hit.to_viewer, to_light) * irradiance

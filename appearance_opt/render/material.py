@@ -13,7 +13,7 @@ import drjit as dr
 import mitsuba as mi
 
 from appearance_opt.render.brdf import MaterialSample
-from appearance_opt.render.math import at_least
+from appearance_opt.render.math import at_least, unit
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -80,4 +80,4 @@ def shading_normal(hit: Hit, sample: MaterialSample) -> mi.Vector3f:
         return hit.normal
     bitangent = dr.cross(hit.normal, hit.tangent) * hit.handedness
     t = sample.normal
-    return dr.normalize(hit.tangent * t.x + bitangent * t.y + hit.normal * t.z)
+    return unit(hit.tangent * t.x + bitangent * t.y + hit.normal * t.z)

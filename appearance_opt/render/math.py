@@ -25,3 +25,10 @@ def at_most(x: mi.Float, high: float | mi.Float) -> mi.Float:
 def clamp(x: mi.Float, low: float | mi.Float, high: float | mi.Float) -> mi.Float:
     """x brought into [low, high]; the gradient is zero outside."""
     return dr.fmin(dr.fmax(x, low), high)
+
+
+def unit(v: mi.Vector3f) -> mi.Vector3f:
+    """v / |v|, and zero with a zero gradient where v is (nearly) zero."""
+    squared = dr.squared_norm(v)
+    ok = squared > 1e-30
+    return dr.select(ok, v * dr.rsqrt(dr.select(ok, squared, 1)), 0)

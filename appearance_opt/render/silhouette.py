@@ -198,11 +198,11 @@ def _points(
     camera = rays.camera_of(records, view)
     ax, ay, az = project(camera, _position(vertices, ends[0]), resolution)
     bx, by, bz = project(camera, _position(vertices, ends[1]), resolution)
-    ox, oy, _ = project(camera, _position(vertices, ends[2]), resolution)
+    ox, oy, oz = project(camera, _position(vertices, ends[2]), resolution)
     nx, ny = ay - by, bx - ax
     scale = dr.rsqrt(dr.fma(nx, nx, ny * ny))
-    # outward: away from the face's third vertex
-    scale = dr.select(nx * (ox - ax) + ny * (oy - ay) > 0, -scale, scale)
+    # outward: away from the face's third vertex; one behind the camera is projected to the other side
+    scale = dr.select((nx * (ox - ax) + ny * (oy - ay) > 0) == (oz > 0), -scale, scale)
     x, y = dr.lerp(ax, bx, s), dr.lerp(ay, by, s)
     depth = dr.rcp(dr.lerp(dr.rcp(az), dr.rcp(bz), s))
     return edge, view, nx * scale, ny * scale, x, y, depth, s

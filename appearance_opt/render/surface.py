@@ -7,12 +7,16 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from appearance_opt.render.math import at_least
+from appearance_opt.render.math import at_least, clamp, unit
 from appearance_opt.render.rays import Camera, Samples, direction
 
 GRAZING_COSINE = 0.2
 """Mip levels are chosen as if no surface were seen at a flatter angle than this: isotropic lookups at
 grazing angles would otherwise blur everything along the short axis of the footprint, too."""
+
+SLACK = 0.1
+"""How far barycentric coordinates may lie outside of the triangle that was hit: rounding of healthy triangles moves
+them by 1e-3 at most, and gradients end at the bounds."""
 
 
 @dataclass
@@ -68,9 +72,10 @@ def interpolate(surface: Surface, camera: Camera, samples: Samples, resolution: 
     determinant = dr.dot(e1, q)
     inverse = dr.rcp(dr.select(dr.abs(determinant) > 1e-30, determinant, 1e-30))
     o = camera.eye - p[0]
-    b1 = dr.dot(o, q) * inverse
+    # within the triangle, where a sliver or a grazing ray leaves no digit of them
+    b1 = clamp(dr.dot(o, q) * inverse, -SLACK, 1 + SLACK)
     r = dr.cross(o, e1)
-    b2 = dr.dot(d, r) * inverse
+    b2 = clamp(dr.dot(d, r) * inverse, -SLACK, 1 + SLACK)
     depth = dr.dot(e2, r) * inverse
 
     facing = dr.detach(dr.cross(e1, e2))
@@ -134,7 +139,7 @@ def _attributes(
     def mix(values: list) -> mi.Float:
         return dr.fma(values[0], b0, dr.fma(values[1], b1, values[2] * b2))
 
-    hit.normal = dr.normalize(mi.Vector3f(*(mix([v[c] for v in rows]) for c in (4, 5, 6))))
+    hit.normal = unit(mi.Vector3f(*(mix([v[c] for v in rows]) for c in (4, 5, 6))))
     if surface.colors is not None:
         c = [_packet(surface.colors, face[k], 4) for k in range(3)]
         hit.color = mi.Color3f(*(mix([v[k] for v in c]) for k in range(3)))
@@ -149,7 +154,7 @@ def _attributes(
     uv_area = dr.abs(a.x * b.y - a.y * b.x)
     hit.footprint = area * uv_area / at_least(dr.detach(twice_area), 1e-30)
     if surface.has_tangents:
-        hit.tangent = dr.normalize(mi.Vector3f(*(mix([v[c] for v in f]) for c in (4, 5, 6))))
+        hit.tangent = unit(mi.Vector3f(*(mix([v[c] for v in f]) for c in (4, 5, 6))))
         hit.handedness = f[0][2]
 
 

@@ -169,7 +169,8 @@ def _wrap(i: mi.Int32, size: mi.Int32, mode: int | mi.Int32) -> mi.Int32:
 def _modulo(i: mi.Int32, size: mi.Int32) -> mi.Int32:
     # floor(i / size) in floating point: integer division has no vector instruction on CPUs
     q = mi.Int32(dr.floor((mi.Float(i) + 0.5) / mi.Float(size)))
-    return i - q * size
+    # far from the origin q is rounded: the remainder must not leave the texture
+    return dr.clip(i - q * size, 0, size - 1)
 
 
 def downsample(texels: mi.Float, size: tuple[int, int], channels: int) -> mi.Float:
