@@ -19,28 +19,19 @@ from appearance_opt.errors import InputError
 from appearance_opt.jobs.simplify import check_paths
 
 JOB = [
-    "simplify",
-    "in.glb",
-    "--triangles",
-    "150",
-    "--texture-size",
-    "32",
-    "--resolution",
-    "32",
-    "--pool",
-    "8",
-    "--views",
-    "2",
-    "--steps",
-    "40",
-    "--device",
-    "cpu",
-]
+    "simplify", "in.glb", "--triangles", "150", "--texture-size", "32", "--resolution", "32",
+    "--pool", "8", "--views", "2", "--steps", "40", "--device", "cpu",
+]  # fmt: skip
+
+# the package beside these tests, whatever is installed
+ENVIRONMENT = {**os.environ, "PYTHONPATH": str(Path(__file__).resolve().parents[1])}
 
 
 def start(folder: Path, *more: str) -> subprocess.Popen[str]:
     command = [sys.executable, "-m", "appearance_opt", *JOB, *more]
-    return subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    return subprocess.Popen(
+        command, cwd=folder, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, env=ENVIRONMENT
+    )
 
 
 def processor_seconds(process: subprocess.Popen[str]) -> float:
@@ -164,7 +155,7 @@ def test_a_full_disk_is_an_error_and_leaves_nothing(ball: Asset, tmp_path: Path)
     save(ball, tmp_path / "in.glb")
     done = subprocess.run(
         [sys.executable, "-c", FULL], cwd=tmp_path, capture_output=True, text=True,
-        env={**os.environ, "PYTHONPATH": str(Path(__file__).resolve().parents[1])},
+        env=ENVIRONMENT,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     lines = done.stdout.splitlines()

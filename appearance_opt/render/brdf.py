@@ -50,6 +50,8 @@ def reflect(material: MaterialSample, n: mi.Vector3f, v: mi.Vector3f, l: mi.Vect
     # (n.h)^2 (alpha^2 - 1) + 1 with the sine from the cross product: near the mirror direction of smooth
     # surfaces 1 - (n.h)^2 has lost its digits (1 % of the radiance at roughness 0.08)
     denominator = dr.fma(dr.square(nh), alpha2, dr.squared_norm(dr.cross(n, h)))
+    # of unit vectors it is never below alpha^2; n and h can be zero where normals cancel
+    denominator = at_least(denominator, 0.5 * alpha2)
     distribution = alpha2 * dr.inv_pi / dr.square(denominator)
     smith = nl * dr.sqrt(dr.fma(dr.square(nv), 1 - alpha2, alpha2))
     smith += nv * dr.sqrt(dr.fma(dr.square(nl), 1 - alpha2, alpha2))
