@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import shutil
 import tempfile
 from pathlib import Path
@@ -22,8 +23,8 @@ if TYPE_CHECKING:
 
 def save_usd(asset: Asset, path: Path) -> None:
     """Write .usd, .usda or .usdc with PNG files in ``<stem>_textures/``, or one .usdz package. Y up,
-    metres."""
-    from pxr import Sdf, UsdUtils
+    metres. Raises OSError when the disk refuses."""
+    from pxr import Sdf, Tf, UsdUtils
 
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -35,7 +36,7 @@ def save_usd(asset: Asset, path: Path) -> None:
         if package:
             with replacing(path) as temporary:
                 if not UsdUtils.CreateNewUsdzPackage(Sdf.AssetPath(str(root)), str(temporary)):
-                    raise OSError(f"{path}: the USDZ package could not be written")
+                    raise OSError(errno.EIO, "the USDZ package could not be written", str(path))
             return
         textures = folder / f"{path.stem}_textures"
         if textures.exists():
@@ -44,6 +45,9 @@ def save_usd(asset: Asset, path: Path) -> None:
             for file in textures.iterdir():
                 file.replace(target / file.name)
         root.replace(path)
+    except Tf.ErrorException as error:  # USD has its own exceptions for what the system reports
+        reason = "the USD file could not be written; is the disk full?"
+        raise OSError(errno.EIO, reason, str(path)) from error
     finally:
         shutil.rmtree(folder, ignore_errors=True)
 
