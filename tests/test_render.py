@@ -13,6 +13,7 @@ from appearance_opt.asset.types import Asset, Material, Mesh, Texture
 from appearance_opt.reference.mesh import MeshReference
 from appearance_opt.render import brdf
 from appearance_opt.render.brdf import MaterialSample
+from appearance_opt.render.deferred import Grid
 from appearance_opt.render.texture import CLAMP, MIRROR, REPEAT, build_pyramid
 from appearance_opt.views import ViewSampler, framing, look_at
 
@@ -173,3 +174,19 @@ def test_textures_of_one_material_may_differ_in_size(ball: Asset) -> None:
     )
     assert np.isfinite(image).all()
     assert image[..., 3].max() == 1
+
+
+def test_a_pair_is_the_image_near_outlines_and_points_elsewhere(ball: Asset) -> None:
+    reference = MeshReference(ball)
+    views = ViewSampler((0.0, 0.0, 0.0), 1.0, seed=2).draw(0, 2)
+    average, points = reference.pair(views, 192, 16, 0.4)
+    full, single = reference.render(views, 192, 16), reference.render_device(views.records(), Grid(2, 192), 1, 0.4)
+    np.testing.assert_array_equal(points, np.array(single).reshape(points.shape))
+    outline = (full[..., 3] > 0) & (full[..., 3] < 1)
+    assert outline.sum() > 100
+    np.testing.assert_allclose(average[outline], full[outline], rtol=1e-4, atol=1e-5)
+    inside = average[..., 3] == points[..., 3]
+    same = (average == points).all(axis=-1)
+    # towards the rim depth changes by more than 2 % over five pixels (measured 0.9)
+    assert same[~outline].mean() > 0.8 and not same[outline].all()
+    assert inside[~outline].all()

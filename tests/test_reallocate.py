@@ -1,0 +1,75 @@
+"""Triangles that move to where the image error is."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from appearance_opt.asset.types import Asset
+from appearance_opt.config import simplify_options
+from appearance_opt.initial.reallocate import HIGHEST, LOWEST, StartError, weights
+from appearance_opt.initial.sphere import sphere
+from appearance_opt.jobs.start import make_start
+from appearance_opt.reference.mesh import MeshReference
+from appearance_opt.views import ViewSampler
+from scenes.analytic import bumpy_sphere
+
+SAMPLER = ViewSampler((0.0, 0.0, 0.0), 1.2, seed=1)
+
+
+def test_weights_follow_the_error() -> None:
+    mesh = sphere(2000, (0.0, 0.0, 0.0), 1.0, 16)
+    faces = mesh.faces
+    visible = np.ones(len(faces), bool)
+    p = mesh.positions.astype(np.float64)
+    area = np.linalg.norm(np.cross(p[faces[:, 1]] - p[faces[:, 0]], p[faces[:, 2]] - p[faces[:, 0]]), axis=1)
+    np.testing.assert_allclose(weights(p, faces, area, visible), 1.0, atol=1e-6)  # error everywhere the same
+    np.testing.assert_array_equal(weights(p, faces, np.zeros(len(faces)), visible), 1.0)
+    right = p[faces].mean(axis=1)[:, 0] > 0
+    uneven = weights(p, faces, np.where(right, 8.0, 1.0) * area, visible)
+    assert uneven[right].mean() > 1.3 * uneven[~right].mean()
+    assert uneven.min() >= LOWEST and uneven.max() <= HIGHEST
+
+
+@pytest.fixture(scope="module")
+def bumps() -> MeshReference:
+    return MeshReference(bumpy_sphere(20_000, 128))
+
+
+def test_the_error_of_a_start_is_found_where_it_is(bumps: MeshReference) -> None:
+    options = simplify_options(triangles=800, texture_size=128, reallocate=0)
+    start = make_start(bumps, options, SAMPLER, 800)
+    judge = StartError(bumps, SAMPLER.held_out(3), views=16)
+    whole, by_face = judge.measure(start.mesh, start.maps)
+    assert by_face.shape == (len(bumps.merged.faces),) and by_face.sum() > 0
+    # one side is dented: the error rises there
+    u = bumps.merged.positions[bumps.merged.faces].mean(axis=1)[:, 0]
+    moved = start.mesh.positions.copy()
+    moved[moved[:, 0] > 0.3] *= 0.9
+    dented, dented_by_face = judge.measure(
+        type(start.mesh)(moved, *(getattr(start.mesh, n) for n in ("faces", "frame_vertex", "frame_faces", "uvs"))),
+        start.maps,
+    )
+    assert dented > 2 * whole
+    rise = dented_by_face - by_face
+    assert rise[u > 0.3].sum() > 3 * rise[u < -0.3].sum()
+
+
+def test_the_best_start_of_all_rounds_is_kept(bumps: MeshReference) -> None:
+    judge = StartError(bumps, SAMPLER.held_out(3))
+    errors = []
+    for rounds in (0, 1):
+        options = simplify_options(triangles=500, texture_size=128, reallocate=rounds)
+        start = make_start(bumps, options, SAMPLER, 500)
+        assert len(start.mesh.faces) <= 500
+        errors.append(judge.measure(start.mesh, start.maps)[0])
+    assert errors[1] <= errors[0]
+
+
+def test_hidden_starts_have_no_error(ball: Asset) -> None:
+    reference = MeshReference(ball)
+    far = ViewSampler((50.0, 0.0, 0.0), 1.0)
+    options = simplify_options(triangles=200, texture_size=32, reallocate=0)
+    start = make_start(reference, options, SAMPLER, 200)
+    error, by_face = StartError(reference, far, views=8).measure(start.mesh, start.maps)
+    assert error == 0.0 and not by_face.any()
