@@ -34,6 +34,9 @@ log = logging.getLogger(__name__)
 
 VISIBILITY_VIEWS = 160
 
+TIGHT_TRIANGLES = 10_000
+"""Largest mesh whose atlas is packed by trying every place: the time grows with the square of the charts."""
+
 
 @dataclass(frozen=True)
 class Start:
@@ -92,12 +95,21 @@ def make_start(reference: MeshReference, options: SimplifyOptions, sampler: View
         positions, low = decimate(merged.positions, faces[visible], triangles, weight[visible])
         if not len(low):
             raise InputError("nothing is left of this mesh at that budget; ask for more triangles")
-        return transferred(reference, unwrap(positions, low, size, gutter(len(low), options)), options)
+        return mapped(positions, low, False)
+
+    def mapped(positions: NDArray, low: NDArray, tight: bool) -> Start:
+        mesh = unwrap(positions, low, size, gutter(len(low), options), tight)
+        return transferred(reference, mesh, options)
 
     start = decimated(weight)
     if not options.reallocate:
         return start
-    return _reallocated(start, weight, visible, decimated, reference, sampler.held_out(3), options.reallocate)
+    judge = StartError(reference, sampler.held_out(3))
+    start, error = _reallocated(start, weight, visible, decimated, judge, options.reallocate)
+    if len(start.mesh.faces) > TIGHT_TRIANGLES:
+        return start
+    packed = mapped(start.mesh.positions, start.mesh.faces, True)
+    return packed if judge.measure(packed.drawn, _images(packed))[0] < error else start
 
 
 def _reallocated(
@@ -105,21 +117,20 @@ def _reallocated(
     weight: NDArray,
     visible: NDArray[np.bool_],
     decimated: Callable[[NDArray], Start],
-    reference: MeshReference,
-    sampler: ViewSampler,
+    judge: StartError,
     rounds: int,
-) -> Start:
-    """The best of a start and those with triangles moved to where its image error is."""
-    judge = StartError(reference, sampler)
+) -> tuple[Start, float]:
+    """The best of a start and those with triangles moved to where its image error is, and its error."""
+    merged = judge.reference.merged
     best, (error, by_face) = start, judge.measure(start.drawn, _images(start))
     for number in range(1, rounds + 1):
-        weight = weight * weights(reference.merged.positions, reference.merged.faces, by_face, visible)
+        weight = weight * weights(merged.positions, merged.faces, by_face, visible)
         candidate = decimated(weight)
         again, by_face = judge.measure(candidate.drawn, _images(candidate))
         log.info("triangles moved, round %d: squared error of the start %.3g -> %.3g", number, error, again)
         if again < error:
             best, error = candidate, again
-    return best
+    return best, error
 
 
 def _images(start: Start) -> dict[str, NDArray]:
