@@ -10,8 +10,13 @@ import sys
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from appearance_opt.errors import BackendError
+
+if TYPE_CHECKING:
+    import mitsuba as mi
+    from numpy.typing import NDArray
 
 CPU, CUDA = "llvm_ad_rgb", "cuda_ad_rgb"
 MINIMUM_LLVM = 15
@@ -50,6 +55,22 @@ def select(device: str = "auto") -> Backend:
     if mi.variant() != variant:
         mi.set_variant(variant)
     return Backend(variant, version, dr.thread_count(), cuda)
+
+
+def to_device(array: NDArray) -> mi.Float:
+    """Upload numbers (any shape, flattened) into memory of Dr.Jit's own.
+
+    A bare ``mi.Float(array)`` may go on using NumPy's memory, whose alignment varies from call to call, and the
+    kernels that read it are compiled for the one or the other.
+    """
+    import drjit as dr
+    import mitsuba as mi
+    import numpy as np
+
+    borrowed = mi.Float(np.ascontiguousarray(array, np.float32).ravel())
+    own = dr.gather(mi.Float, borrowed, dr.arange(mi.UInt32, dr.width(borrowed)))
+    dr.eval(own)
+    return own
 
 
 def install_hint() -> str:

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from appearance_opt.backend import to_device
+
 if TYPE_CHECKING:
     import mitsuba as mi
     from numpy.typing import NDArray
@@ -46,8 +48,6 @@ class Views:
 
     def records(self) -> mi.Float:
         """Upload: B records of ``RECORD`` floats."""
-        import mitsuba as mi
-
         packed = np.concatenate(
             [
                 *(
@@ -58,7 +58,7 @@ class Views:
             ],
             axis=1,
         )
-        return mi.Float(np.ascontiguousarray(packed, np.float32).ravel())
+        return to_device(packed)
 
 
 def look_at(

@@ -9,6 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from appearance_opt.backend import to_device
 from appearance_opt.fit import adam
 from appearance_opt.fit.losses import covered_loss, image_loss
 from appearance_opt.fit.model import TEXELS, Model
@@ -65,7 +66,7 @@ def gradients(
     edges = model.topology.edges
     frame = gradient.render(model.scene, surface, maps, edges, records, grid, quality, inputs.seed, defer=True)
     behind = np.concatenate([inputs.background, np.zeros((len(inputs.background), 1))], axis=1)
-    background = mi.Float(np.ascontiguousarray(behind, np.float32).ravel())
+    background = to_device(behind)
     per_view = dr.opaque(mi.UInt32, grid.resolution**2)
 
     average = inputs.reference.average

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 
@@ -45,8 +44,8 @@ class ReferencePool:
     resolution: int
     samples: int
     point_width: float = 0.4
-    _images: dict[int, mi.Float16] = field(default_factory=dict)
-    _points: dict[int, mi.Float16] = field(default_factory=dict)
+    _images: dict[int, NDArray[np.float16]] = field(default_factory=dict)
+    _points: dict[int, NDArray[np.float16]] = field(default_factory=dict)
     _views: dict[int, Views] = field(default_factory=dict)
 
     def draw(self, iteration: int) -> tuple[Views, Targets]:
@@ -62,7 +61,8 @@ class ReferencePool:
             self._render(sorted({k // self.batch for k in missing}))
         views = Views.concatenate([self._views[int(k)] for k in members])
         images, points = (
-            mi.Float(dr.concat([kept[int(k)] for k in members])) if kept else None
+            # joined on the host: dr.concat compiles a kernel for every layout of its inputs
+            mi.Float(mi.Float16(np.concatenate([kept[int(k)] for k in members]))) if kept else None
             for kept in (self._images, self._points)
         )
         assert images is not None
@@ -80,10 +80,10 @@ class ReferencePool:
             for k in range(self.batch):
                 self._views[group * self.batch + k] = views[k : k + 1]
 
-    def _keep(self, kept: dict[int, mi.Float16], group: int, images: NDArray[np.float32]) -> None:
+    def _keep(self, kept: dict[int, NDArray[np.float16]], group: int, images: NDArray[np.float32]) -> None:
         images = np.minimum(checked(images, f"pool batch {group}"), np.finfo(np.float16).max).astype(np.float16)
         for k in range(self.batch):
-            kept[group * self.batch + k] = mi.Float16(images[k].ravel())
+            kept[group * self.batch + k] = images[k].ravel()
 
 
 def checked(images: NDArray[np.float32], what: str) -> NDArray[np.float32]:
