@@ -15,8 +15,9 @@ import mitsuba as mi
 import numpy as np
 
 from appearance_opt import backend
+from appearance_opt.backend import to_device
 from appearance_opt.fit import adam
-from appearance_opt.fit.losses import LOSSES, image_loss
+from appearance_opt.fit.losses import LOSSES, covered_loss, image_loss
 from appearance_opt.fit.model import POSITIONS, TEXELS
 from appearance_opt.render import gradient
 from appearance_opt.render.deferred import Grid
@@ -70,29 +71,36 @@ def stages(resolution: int, maps: int) -> dict[str, float]:
     surface, layer = model.surface(positions), model.fitted_layer()
     dr.enable_grad(layer.pyramid.texels)
     scene, all_maps = model.scene, model.maps(layer)
-    none = Quality(0.0, 1, 1)
-    timed(
-        "forward without edges", lambda: gradient.render(scene, surface, all_maps, edges, records, grid, none, 0).image
-    )
-    timed(
-        "forward with edges", lambda: gradient.render(scene, surface, all_maps, edges, records, grid, quality, 0).image
-    )
-    frame = gradient.render(scene, surface, all_maps, edges, records, grid, quality, 0)
-    background = mi.Float(np.full(16, 0.3, np.float32))
-    loss = LOSSES["log-srgb-l1"]
-    timed("loss and its gradient", lambda: image_loss(loss, frame.image, reference, background, resolution**2))
-    _, by_image = image_loss(loss, frame.image, reference, background, resolution**2)
+    background = to_device(np.full((4, 4), 0.3))
+    loss, per_view = LOSSES["log-srgb-l1"], dr.opaque(mi.UInt32, resolution**2)
+
+    def forward(quality: Quality) -> gradient.Frame:
+        return gradient.render(scene, surface, all_maps, edges, records, grid, quality, 0, defer=True)
+
+    timed("visibility alone", lambda: forward(Quality(0.0, 1, 1)).image)
+    timed("visibility, silhouettes, averaged pixels", lambda: forward(quality).image)
+    frame = forward(quality)
+
+    def averaged() -> tuple:
+        return image_loss(loss, frame.image, reference, background, per_view, frame.complete())
+
+    timed("loss of averaged pixels", averaged)
+    _, by_image = averaged()
 
     def backward() -> tuple:
         p = mi.Float(model.positions())
         dr.enable_grad(p)
         texels = mi.Float(dr.detach(layer.pyramid.texels))
         dr.enable_grad(texels)
-        fresh = model.maps(layer.with_texels(texels))
-        dr.backward(gradient.surrogate(frame, model.surface(p), fresh, edges, by_image, quality))
+        fresh, moving = model.maps(layer.with_texels(texels)), model.surface(p)
+        terms = gradient.surrogate(frame, moving, fresh, edges, by_image)
+        direct = gradient.direct(
+            frame, moving, fresh, lambda c, pixel: covered_loss(loss, c, pixel, reference, background, per_view)
+        )
+        gradient.backward([*terms, direct])
         return dr.grad(p), dr.grad(texels)
 
-    grads = timed("backward (normals and frames included)", backward)
+    grads = timed("shading, loss and gradients of all other pixels", backward)
     parameter = model.parameters[TEXELS]
     timed("pyramid gradient to texels", lambda: model.codec.pull_back(grads[1], parameter.value))
     down = model.codec.pull_back(grads[1], parameter.value)
