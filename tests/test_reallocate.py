@@ -9,7 +9,7 @@ from appearance_opt.asset.types import Asset
 from appearance_opt.config import simplify_options
 from appearance_opt.initial.reallocate import HIGHEST, LOWEST, StartError, weights
 from appearance_opt.initial.sphere import sphere
-from appearance_opt.jobs.start import make_start
+from appearance_opt.jobs.start import affordable, make_start
 from appearance_opt.reference.mesh import MeshReference
 from appearance_opt.views import ViewSampler
 from scenes.analytic import bumpy_sphere
@@ -64,6 +64,14 @@ def test_the_best_start_of_all_rounds_is_kept(bumps: MeshReference) -> None:
         assert len(start.mesh.faces) <= 500
         errors.append(judge.measure(start.mesh, start.maps)[0])
     assert errors[1] <= errors[0]
+
+
+@pytest.mark.parametrize(
+    ("budget", "seconds", "rounds"), [(65.0, 5.0, 2), (65.0, 15.0, 1), (65.0, 60.0, 0), (None, 60.0, 2)]
+)
+def test_slow_decimations_are_not_repeated(budget: float | None, seconds: float, rounds: int) -> None:
+    options = simplify_options(triangles=200, reallocate=2, budget=budget)
+    assert affordable(options, seconds) == rounds
 
 
 def test_hidden_starts_have_no_error(ball: Asset) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -33,6 +34,9 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 VISIBILITY_VIEWS = 160
+
+REALLOCATION_SHARE = 0.3
+"""Part of a time budget that moving triangles may take."""
 
 TIGHT_TRIANGLES = 10_000
 """Largest mesh whose atlas is packed by trying every place: the time grows with the square of the charts."""
@@ -101,15 +105,25 @@ def make_start(reference: MeshReference, options: SimplifyOptions, sampler: View
         mesh = unwrap(positions, low, size, gutter(len(low), options), tight)
         return transferred(reference, mesh, options)
 
+    began = time.perf_counter()
     start = decimated(weight)
-    if not options.reallocate:
+    rounds = affordable(options, time.perf_counter() - began)
+    if not rounds:
         return start
     judge = StartError(reference, sampler.held_out(3))
-    start, error = _reallocated(start, weight, visible, decimated, judge, options.reallocate)
+    start, error = _reallocated(start, weight, visible, decimated, judge, rounds)
     if len(start.mesh.faces) > TIGHT_TRIANGLES:
         return start
     packed = mapped(start.mesh.positions, start.mesh.faces, True)
     return packed if judge.measure(packed.drawn, _images(packed))[0] < error else start
+
+
+def affordable(options: SimplifyOptions, seconds: float) -> int:
+    """Rounds of reallocation, of those asked for, that leave most of a time budget to the fit when one takes
+    ``seconds``."""
+    if options.budget is None or seconds <= 0:
+        return options.reallocate
+    return min(options.reallocate, int(REALLOCATION_SHARE * options.budget / seconds))
 
 
 def _reallocated(
