@@ -40,6 +40,9 @@ RINGS = 6
 """Rings of faces over which the error is averaged: about the size of a new triangle. Without it the noise of
 single pixels would be taken for detail."""
 
+FIXED_POINT = 2.0**32
+"""Errors are added up as integers: threads may add them in any order without changing the start."""
+
 POWER, LOWEST, HIGHEST = 0.35, 0.3, 3.0
 """Weight = (error over its median)^POWER within bounds. Larger powers overshoot (0.6 loses what 0.35 gains)."""
 
@@ -55,7 +58,7 @@ class StartError:
 
     def measure(self, mesh: LatentMesh, maps: Mapping[str, NDArray]) -> tuple[float, NDArray[np.float64]]:
         """(mean squared display error, its sum over the pixels that show each face of the reference (F,))."""
-        total = dr.zeros(mi.Float, len(self.reference.merged.faces))
+        total = dr.zeros(mi.UInt64, len(self.reference.merged.faces))
         scene, topology = upload.scene_of(mesh.positions, mesh.faces), LatentTopology(mesh, tangents=True)
         codec = TexelCodec(tuple(c for c in CHANNELS if c in maps), len(maps["red"]))
         layers = MaterialMaps((codec.layer(codec.encode(maps)),))
@@ -68,16 +71,16 @@ class StartError:
             # a pixel's neighbours answer for it, too: beside an outline the reference shows nothing to blame
             spread = maximum_filter(error, size=(1, 3, 3))
             self._collect(total, records, mi.Float(spread.ravel()))
-        return mean, np.array(total).astype(np.float64)
+        return mean, np.array(total).astype(np.float64) / FIXED_POINT
 
-    def _collect(self, total: mi.Float, records: mi.Float, error: mi.Float) -> None:
+    def _collect(self, total: mi.UInt64, records: mi.Float, error: mi.Float) -> None:
         g = self._grid
         hits = rays.trace(
             self.reference.scene, records, g.view, mi.Float(g.column) + 0.5, mi.Float(g.row) + 0.5, g.size
         )
         seen = hits.triangle != rays.MISS
         pixel = (g.view * g.rows + g.row) * g.rows + g.column
-        value = dr.gather(mi.Float, error, pixel)
+        value = mi.UInt64(dr.gather(mi.Float, error, pixel) * FIXED_POINT)
         dr.scatter_reduce(dr.ReduceOp.Add, total, value, dr.select(seen, hits.triangle, 0), seen)
         dr.eval(total)
 
@@ -98,4 +101,7 @@ def weights(positions: NDArray, faces: NDArray, error: NDArray, visible: NDArray
     middle = np.median(density[visible]) if visible.any() else 0.0
     if middle <= 0:
         return np.ones(len(faces))
-    return np.clip((density / middle) ** POWER, LOWEST, HIGHEST)
+    return np.clip((density / middle) ** FIXED_POINT = 2.0**32
+"""Errors are added up as integers: threads may add them in any order without changing the start."""
+
+POWER, LOWEST, HIGHEST)
