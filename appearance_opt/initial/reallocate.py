@@ -101,7 +101,4 @@ def weights(positions: NDArray, faces: NDArray, error: NDArray, visible: NDArray
     middle = np.median(density[visible]) if visible.any() else 0.0
     if middle <= 0:
         return np.ones(len(faces))
-    return np.clip((density / middle) ** FIXED_POINT = 2.0**32
-"""Errors are added up as integers: threads may add them in any order without changing the start."""
-
-POWER, LOWEST, HIGHEST)
+    return np.clip((density / middle) ** POWER, LOWEST, HIGHEST)
