@@ -85,23 +85,16 @@ def render_image(
     Returns (pixels * 4) premultiplied linear radiance and coverage. One sample of all pixels at a time,
     so that memory does not grow with ``samples``.
     """
-    filtered = dr.opaque(mi.Float, samples**-0.5 if width is None else width)
+    filtered = samples**-0.5 if width is None else width
     image = dr.zeros(mi.Float, grid.pixels * 4)
-    weight = dr.opaque(mi.Float, 1 / samples)
     for dx, dy in rays.sub_pixel_offsets(samples):
         x = mi.Float(grid.column) + dr.opaque(mi.Float, dx)
         y = mi.Float(grid.row) + dr.opaque(mi.Float, dy)
         hits = rays.trace(scene, records, grid.view, x, y, grid.size)
         dr.eval(hits)
-        index = dr.compress(hits.triangle != rays.MISS)
-        if dr.width(index) == 0:
-            continue
-        hits = rays.keep(hits, index)
-        color = shade(surface, maps, records, hits, grid.size, filtered)
-        value = mi.ArrayXf([color.x * weight, color.y * weight, color.z * weight, weight])
+        covered = rays.keep(hits, dr.compress(hits.triangle != rays.MISS))
         # one sample per pixel in each pass: no two threads meet
-        dr.scatter_reduce(dr.ReduceOp.Add, image, value, pixel_index(hits, grid.rows), mode=dr.ReduceMode.NoConflicts)
-        dr.eval(image)
+        _add_shaded(image, surface, maps, records, grid, covered, samples, filtered, dr.ReduceMode.NoConflicts)
     return image
 
 
@@ -129,9 +122,8 @@ def render_pair(
     )
     dr.eval(hits, depth)
     points = dr.zeros(mi.Float, grid.pixels * 4)
-    _add_shaded(
-        points, surface, maps, records, grid, rays.keep(hits, dr.compress(hits.triangle != rays.MISS)), 1, width
-    )
+    covered = rays.keep(hits, dr.compress(hits.triangle != rays.MISS))
+    _add_shaded(points, surface, maps, records, grid, covered, 1, width, dr.ReduceMode.NoConflicts)
     near_outline = mi.Bool(_near_outlines(hits, depth, grid))
     average = dr.select(dr.gather(mi.Bool, near_outline, dr.arange(mi.UInt32, grid.pixels * 4) // 4), 0, points)
     dr.eval(average)
@@ -139,7 +131,7 @@ def render_pair(
     index = dr.compress(dr.gather(mi.Bool, near_outline, pixel))
     if dr.width(index):
         fine = rays.trace_pixels(scene, records, grid.view, grid.column, grid.row, index, samples, grid.size)
-        _add_shaded(average, surface, maps, records, grid, fine, samples, samples**-0.5)
+        _add_shaded(average, surface, maps, records, grid, fine, samples, samples**-0.5, dr.ReduceMode.Local)
     return average, points
 
 
@@ -162,13 +154,13 @@ def _add_shaded(
     hits: Samples,
     samples: int,
     width: float,
+    mode: dr.ReduceMode,
 ) -> None:
     """Add the radiance and coverage of hits, each 1 / ``samples`` of its pixel, to an image (pixels * 4)."""
     if dr.width(hits.triangle) == 0:
         return
     color = shade(surface, maps, records, hits, grid.size, dr.opaque(mi.Float, width))
     w = dr.opaque(mi.Float, 1 / samples)
-    mode = dr.ReduceMode.NoConflicts if samples == 1 else dr.ReduceMode.Local
     value = mi.ArrayXf([color.x * w, color.y * w, color.z * w, w])
     dr.scatter_reduce(dr.ReduceOp.Add, image, value, pixel_index(hits, grid.rows), mode=mode)
     dr.eval(image)
