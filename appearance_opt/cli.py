@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import logging
+import signal
 import sys
 import time
 from pathlib import Path
@@ -36,6 +37,8 @@ def main() -> None:
         code = app(standalone_mode=False)
         if code == INTERRUPTED:  # how typer hands on a Ctrl-C
             raise KeyboardInterrupt
+        # all is done: a Ctrl-C while the interpreter takes itself apart must not look like a failure
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
     except AppearanceError as error:
         _fail(str(error))
     except OSError as error:
