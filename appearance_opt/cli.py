@@ -19,7 +19,9 @@ BEGAN = time.perf_counter()
 """Time budgets count from here: importing is part of a run."""
 
 INTERRUPTED = 130
-"""Exit code after a Ctrl-C that left no result: 128 + SIGINT, as shells have it."""
+"""Exit code after a Ctrl-C that ended a command: 128 + SIGINT, as shells have it."""
+
+INTERRUPTION = "interrupted; what was written is complete"
 
 app = typer.Typer(
     add_completion=False,
@@ -45,13 +47,13 @@ def main() -> None:
         reason = "the disk is full" if error.errno == errno.ENOSPC else (error.strerror or str(error))
         _fail(f"{error.filename or 'file'}: {reason}")
     except KeyboardInterrupt:
-        _fail("interrupted: nothing was written", INTERRUPTED)
+        _fail(INTERRUPTION, INTERRUPTED)
     except MemoryError:
         _fail("not enough memory; try a smaller --texture-size, --resolution or --pool")
     except Exception as error:
         # the parser's own errors (typer may bundle its parser, so they are known by what they can do)
         if type(error).__name__ == "Abort":  # a Ctrl-C, in other versions of typer
-            _fail("interrupted: nothing was written", INTERRUPTED)
+            _fail(INTERRUPTION, INTERRUPTED)
         if not hasattr(error, "format_message"):
             raise
         _fail(error.format_message())

@@ -106,9 +106,10 @@ def interrupt(job: tuple[Path, float], tmp_path: Path, moments: np.ndarray) -> N
         code, error = stopped_at(process, max(share * seconds, 0.5), signal.SIGINT)
         assert "Traceback" not in error and "Exception ignored" not in error, error
         assert code in (0, 130), error
-        assert (tmp_path / f"low{k}.glb").exists() == (code == 0)
-        if code == 130:
-            assert "interrupted: nothing was written" in error
+        if code == 0:
+            assert (tmp_path / f"low{k}.glb").exists()
+        else:  # before the fit, or in the instant after the result was renamed
+            assert "error: interrupted; what was written is complete" in error
         check_whole(tmp_path)
 
 

@@ -87,10 +87,10 @@ def bake(
     if error is not None:
         raise error
     if report is not None:
-        from appearance_opt.jobs.report import write_bake_report
-
         result.seconds = dict(watch.stages)
         with optional_report(result.notes):
+            from appearance_opt.jobs.report import write_bake_report
+
             write_bake_report(Path(report), run.high, result, run.sampler, run.frame, options)
         watch.lap("report")
     result.seconds = {**watch.stages, "total": watch.total}

@@ -92,10 +92,10 @@ def simplify(
     if result.error is not None:
         raise result.error
     if report is not None:
-        from appearance_opt.jobs.report import write_simplify_report
-
         result.seconds = dict(watch.stages)
         with optional_report(result.notes):
+            from appearance_opt.jobs.report import write_simplify_report
+
             write_simplify_report(Path(report), asset, result, run.sampler, run.frame, options)
         watch.lap("report")
     result.seconds = {**watch.stages, "total": watch.total}
