@@ -7,12 +7,13 @@ import pytest
 import trimesh
 
 from appearance_opt.asset.types import Asset
+from appearance_opt.baking.points import texel_coverage
 from appearance_opt.evaluate.metrics import compare_images
 from appearance_opt.initial.atlas import unwrap
 from appearance_opt.initial.decimate import decimate
 from appearance_opt.initial.fill import fill
 from appearance_opt.initial.sphere import sphere
-from appearance_opt.initial.transfer import texel_coverage, transfer
+from appearance_opt.initial.transfer import transfer
 from appearance_opt.initial.visibility import importance, pixel_counts
 from appearance_opt.latent.export import to_asset
 from appearance_opt.reference.mesh import MeshReference

@@ -12,6 +12,13 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 
+def edges_of(faces: NDArray) -> NDArray[np.int64]:
+    """(E, 2) the edges of triangles (F, 3), each once, the lower index first."""
+    corners = np.asarray(faces, np.int64)
+    pairs = np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]])
+    return np.unique(np.sort(pairs, axis=1), axis=0)
+
+
 class Laplacian:
     """L = mean over vertices of |delta_i - delta'_i|^2 / h_i^2.
 
@@ -22,9 +29,7 @@ class Laplacian:
     """
 
     def __init__(self, positions: NDArray, faces: NDArray, edge_length: NDArray, relative: bool) -> None:
-        corners = np.asarray(faces, np.int64)
-        pairs = np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]])
-        pairs = np.unique(np.sort(pairs, axis=1), axis=0)
+        pairs = edges_of(faces)
         degree = np.maximum(np.bincount(pairs.ravel(), minlength=len(positions)), 1)
         self._a = mi.UInt32(np.ascontiguousarray(pairs[:, 0], np.uint32))
         self._b = mi.UInt32(np.ascontiguousarray(pairs[:, 1], np.uint32))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
@@ -132,6 +132,8 @@ class _Run:
         self.progress, self.checkpointer = progress, checkpointer
         self.loss = loss_of_name(options.loss)
         self.grid = Grid(pool.batch, pool.resolution)
+        # points can only be compared if both sides filter alike
+        self.quality = replace(options.quality, point_width=pool.point_width)
         self.result = FitResult()
         self.state = FitState(moments={n: adam.moments_of(p) for n, p in model.parameters.items()})
         self.laplacians: dict[int, Laplacian] = {}
@@ -162,9 +164,7 @@ class _Run:
             seed=state.iteration,
             want_loss=state.iteration % LOSS_EVERY == 0 or state.laplacian == 0,
         )
-        done = step(
-            self.model, state.moments, self.grid, options.quality, self.loss, laplacian, inputs, first_non_finite
-        )
+        done = step(self.model, state.moments, self.grid, self.quality, self.loss, laplacian, inputs, first_non_finite)
         self._count(done.bad)
         if done.bad is None and done.loss is not None:
             state.loss = done.loss

@@ -119,7 +119,8 @@ class Model:
             self._relief_codec = self._relief(np.asarray(maps[DISPLACEMENT]), DISPLACEMENT in fit)
         self.set_rates(rates)
         for drawn in self._drawn.values():
-            drawn.move(drawn.pose(self.shape()))
+            if drawn.tessellator is not None:  # without one, the scene was made where it is
+                drawn.move(drawn.pose(self.shape()))
 
     def _texel_parameter(self, name: str, channels: tuple[str, ...], images: Mapping[str, NDArray]) -> TexelCodec:
         codec = TexelCodec(channels, len(images[channels[0]]))

@@ -14,6 +14,8 @@ import numpy as np
 from scipy.sparse import coo_matrix, csc_matrix, identity
 from scipy.sparse.linalg import splu
 
+from appearance_opt.fit.laplacian import edges_of
+
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
@@ -24,9 +26,7 @@ class Smoother:
     host (0.5 ms for 5,000 vertices)."""
 
     def __init__(self, vertices: int, faces: NDArray, strength: float) -> None:
-        corners = np.asarray(faces, np.int64)
-        pairs = np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]])
-        pairs = np.unique(np.sort(pairs, axis=1), axis=0)
+        pairs = edges_of(faces)
         i, j = np.concatenate([pairs, pairs[:, ::-1]]).T
         adjacency = coo_matrix((np.ones(len(i)), (i, j)), (vertices, vertices)).tocsc()
         degree = np.asarray(adjacency.sum(axis=1)).ravel()

@@ -15,8 +15,7 @@ import mitsuba as mi
 import numpy as np
 from scipy.ndimage import maximum_filter
 
-from appearance_opt.asset.normals import weld
-from appearance_opt.initial.visibility import around
+from appearance_opt.initial.visibility import around, welded_areas
 from appearance_opt.latent.latent import LatentTopology
 from appearance_opt.latent.texels import TexelCodec
 from appearance_opt.render import rays, upload
@@ -54,7 +53,7 @@ class StartError:
         self.reference = reference
         self._grid = Grid(BATCH, RESOLUTION)
         self._records = [sampler.draw(k, BATCH).records() for k in range(views // BATCH)]
-        self._images = [self._display(reference.render_device(r, self._grid, SAMPLES, 0.5)) for r in self._records]
+        self._images = [self._display(reference.render_device(r, self._grid, SAMPLES)) for r in self._records]
 
     def measure(self, mesh: LatentMesh, maps: Mapping[str, NDArray]) -> tuple[float, NDArray[np.float64]]:
         """(mean squared display error, its sum over the pixels that show each face of the reference (F,))."""
@@ -91,12 +90,9 @@ class StartError:
 def weights(positions: NDArray, faces: NDArray, error: NDArray, visible: NDArray) -> NDArray[np.float64]:
     """(F,) factors for the importance of faces from the image error collected on each: error per area, averaged
     over ``RINGS`` rings, relative to the median of the visible faces."""
-    first, place = weld(np.asarray(positions))
-    f = place[faces]
-    p = np.asarray(positions, np.float64)[first]
-    area = 0.5 * np.linalg.norm(np.cross(p[f[:, 1]] - p[f[:, 0]], p[f[:, 2]] - p[f[:, 0]]), axis=1)
+    f, area, vertices = welded_areas(positions, faces)
     for _ in range(RINGS):
-        error, area = (around(x, f, len(p))[f].mean(axis=1) / 6 for x in (error, area))
+        error, area = (around(x, f, vertices)[f].mean(axis=1) / 6 for x in (error, area))
     density = error / np.maximum(area, 1e-30)
     middle = np.median(density[visible]) if visible.any() else 0.0
     if middle <= 0:

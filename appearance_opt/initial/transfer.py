@@ -5,13 +5,10 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from appearance_opt.baking.closed_form import BakedMaps, Settings, bake
-from appearance_opt.baking.points import texel_coverage
 
 if TYPE_CHECKING:
     from appearance_opt.latent.latent import LatentMesh
     from appearance_opt.reference.mesh import MeshReference
-
-__all__ = ["texel_coverage", "transfer"]
 
 SAMPLES = 1
 """Rays per texel. More blur the maps: a texel is read bilinearly, which averages once already."""

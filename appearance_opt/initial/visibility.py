@@ -46,11 +46,7 @@ def importance(positions: NDArray, faces: NDArray, counts: NDArray) -> tuple[NDA
     Importance is pixels per area, averaged over the faces around each vertex and relative to the best
     seen part of the surface, so that recesses and undersides get a smaller share of the triangles.
     """
-    first, place = weld(np.asarray(positions))
-    f = place[faces]
-    p = np.asarray(positions, np.float64)[first]
-    area = 0.5 * np.linalg.norm(np.cross(p[f[:, 1]] - p[f[:, 0]], p[f[:, 2]] - p[f[:, 0]]), axis=1)
-    n = len(p)
+    f, area, n = welded_areas(positions, faces)
     visible = counts > 0
     for _ in range(MARGIN):
         near = np.zeros(n, bool)
@@ -60,6 +56,15 @@ def importance(positions: NDArray, faces: NDArray, counts: NDArray) -> tuple[NDA
     density = density[f].mean(axis=1)
     best = np.quantile(density[visible], 0.9) if visible.any() else 1.0
     return np.where(visible, np.clip(density / max(best, 1e-30), FLOOR, 1.0), HIDDEN), visible
+
+
+def welded_areas(positions: NDArray, faces: NDArray) -> tuple[NDArray, NDArray[np.float64], int]:
+    """(faces over welded vertices (F, 3), their areas (F,), number of welded vertices)."""
+    first, place = weld(np.asarray(positions))
+    f = place[faces]
+    p = np.asarray(positions, np.float64)[first]
+    area = 0.5 * np.linalg.norm(np.cross(p[f[:, 1]] - p[f[:, 0]], p[f[:, 2]] - p[f[:, 0]]), axis=1)
+    return f, area, len(p)
 
 
 def around(values: NDArray, faces: NDArray, count: int) -> NDArray:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import time
 from contextlib import contextmanager
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -106,7 +105,6 @@ def fit_start(
     given = (o.position_rate, o.normal_rate, o.color_rate, o.material_rate, o.displacement_rate)
     defaults = (rates.position, rates.normal, rates.base_color, rates.material, rates.displacement)
     model.set_rates(Rates(*(d if g is None else g for g, d in zip(given, defaults, strict=True))))
-    quality = replace(quality, point_width=width)
     watch.lap("set-up")
     seconds = seconds_left(o, watch, with_report)
     if seconds == 0.0:

@@ -29,7 +29,6 @@ from appearance_opt.latent.export import to_asset
 from appearance_opt.latent.latent import LatentMesh
 from appearance_opt.reference.mesh import MeshReference
 from appearance_opt.reference.pool import ReferencePool
-from appearance_opt.render.gradient import Quality
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -67,7 +66,8 @@ def grown(
     """(start, interrupted) after at most ``seconds`` or ``steps``. Only images of the reference are used."""
     texture = min(TEXTURE, options.texture_size)
     mesh = sphere(OVERSAMPLING * triangles, sampler.centre, 0.6 * sampler.radius, texture)
-    model = Model(mesh, random_maps(texture, options.seed, "normal" in options.fit), frozenset(options.fit), RATES)
+    maps = random_maps(texture, options.seed, options.normal_map and "normal" in options.fit)
+    model = Model(mesh, maps, frozenset(options.fit), RATES)
     model.precondition(len(mesh.faces) / TRIANGLES_PER_STRENGTH, RATES.position)
     pool = ReferencePool(reference, sampler, POOL, VIEWS, RESOLUTION, POOL_SAMPLES, POINT_WIDTH)
     validation = Validation(reference, sampler.held_out(1).draw(0, VALIDATION_VIEWS), RESOLUTION)
@@ -78,7 +78,6 @@ def grown(
         laplacian=0.0,
         decay=1.0,
         background=options.background_color(),
-        quality=Quality(point_width=POINT_WIDTH),
         seed=options.seed,
     )
     result = fit(model, pool, validation, fit_options, progress)

@@ -72,7 +72,7 @@ class MeshReference:
     def render(self, views: Views, resolution: int, samples: int = 16) -> NDArray[np.float32]:
         """See ``Reference.render``."""
         parts = self._parts(views, resolution)
-        images = [_host(self.render_device(p.records(), g, samples, samples**-0.5), g) for p, g in parts]
+        images = [_host(self.render_device(p.records(), g, samples), g) for p, g in parts]
         return np.concatenate(images)
 
     def pair(
@@ -97,9 +97,9 @@ class MeshReference:
                 grid = Grid(len(part), resolution)
             yield part, grid
 
-    def render_device(self, records: mi.Float, grid: Grid, samples: int, width: float = 1.0) -> mi.Float:
+    def render_device(self, records: mi.Float, grid: Grid, samples: int, width: float | None = None) -> mi.Float:
         """The same for a batch whose records are on the device; the image stays there, flat. Textures are filtered
-        over ``width`` pixels."""
+        over ``width`` pixels (the share of a sample)."""
         with dr.suspend_grad():
             return deferred.render_image(self.scene, self.surface, self.maps, records, grid, samples, width)
 
