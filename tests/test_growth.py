@@ -83,10 +83,34 @@ def test_a_resumed_growth_goes_on_from_the_same_start(ball: Asset, tmp_path: Pat
     assert again.fit.steps == first.fit.steps
 
 
-def test_a_broken_start_is_refused(tmp_path: Path) -> None:
-    def never() -> tuple[Start, bool]:
-        raise AssertionError("a start that is there is not made again")
+def never() -> tuple[Start, bool]:
+    raise AssertionError("a start that is there is not made again")
 
-    (tmp_path / "start.npz").write_bytes(b"not a start")
+
+def test_a_broken_start_is_refused(ball: Asset, tmp_path: Path) -> None:
+    path = tmp_path / "start.npz"
+    path.write_bytes(b"not a start")
     with pytest.raises(InputError, match="not a usable start"):
-        kept(tmp_path / "start.npz", never)
+        kept(path, "job", never)
+    simplify(ball, None, options(steps=2), checkpoint=tmp_path)
+    path.write_bytes(path.read_bytes()[:-100])  # a whole archive, cut short
+    with pytest.raises(InputError, match="not a usable start"):
+        kept(path, "job", never)
+
+
+def test_the_start_of_another_job_is_refused(ball: Asset, tmp_path: Path) -> None:
+    simplify(ball, None, options(steps=2), checkpoint=tmp_path)
+    (tmp_path / "fit.npz").unlink()  # killed between growing and the first checkpoint
+    with pytest.raises(InputError, match="another input or other options"):
+        simplify(ball, None, options(steps=2, seed=5), checkpoint=tmp_path, resume=True)
+
+
+def test_growing_counts_among_the_steps(ball: Asset) -> None:
+    seen: list[int] = []
+
+    class Steps:
+        def update(self, step: int, *rest: object) -> None:
+            seen.append(step)
+
+    simplify(ball, None, options(steps=20), progress=Steps())
+    assert len(seen) == 20 and max(seen) == 13  # 7 steps of growing, then 13 of the fit

@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import logging
-import os
-import tempfile
 import time
-import zipfile
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,6 +12,7 @@ import mitsuba as mi
 import numpy as np
 
 from appearance_opt.errors import InputError
+from appearance_opt.fit import archive
 from appearance_opt.fit.adam import Moments
 
 if TYPE_CHECKING:
@@ -68,8 +66,8 @@ class Checkpointer:
         return time.monotonic() - self._last >= self.interval
 
     def save(self, model: Model, state: FitState) -> None:
-        """Write to a temporary name, then rename: a killed run leaves the previous checkpoint whole."""
-        arrays: dict[str, np.ndarray] = {"fingerprint": np.array(self.fingerprint)}
+        """Write the state; see ``archive.write``."""
+        arrays: dict[str, np.ndarray] = {}
         arrays.update({name: np.array(getattr(state, name)) for name in _NUMBERS})
         arrays["curve"] = np.array(state.curve, np.float64).reshape(-1, 4)
         for name, parameter in model.parameters.items():
@@ -81,14 +79,7 @@ class Checkpointer:
             arrays[f"steps/{name}"] = np.array(moments.steps)
             if state.best is not None:
                 arrays[f"best/{name}"] = np.array(state.best[name])
-        with tempfile.NamedTemporaryFile(dir=self.path.parent, suffix=".tmp", delete=False) as file:
-            try:
-                np.savez(file, allow_pickle=False, **arrays)
-                file.flush()
-                os.replace(file.name, self.path)
-            except BaseException:
-                Path(file.name).unlink(missing_ok=True)
-                raise
+        archive.write(self.path, self.fingerprint, arrays)
         self._last = time.monotonic()
 
     def restore(self, model: Model, state: FitState) -> bool:
@@ -100,16 +91,9 @@ class Checkpointer:
             log.info("no checkpoint in %s: starting from the beginning", self.path.parent)
             return False
         try:
-            # opened here: NumPy leaves its own handle open when the archive is cut short
-            with self.path.open("rb") as stored, np.load(stored) as file:
-                arrays = {k: file[k] for k in file.files}
-            if str(arrays["fingerprint"]) != self.fingerprint:
-                raise InputError(
-                    f"{self.path}: this checkpoint belongs to another input or other options; "
-                    "resume with the same ones, or choose another --checkpoint folder"
-                )
+            arrays = archive.read(self.path, self.fingerprint)
             _fill(model, state, arrays)
-        except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        except archive.UNREADABLE as error:
             raise InputError(f"{self.path}: not a usable checkpoint ({error}); delete it to start anew") from error
         model.update_scene()
         return True

@@ -9,14 +9,12 @@ an atlas of full size.
 from __future__ import annotations
 
 import logging
-import os
-import tempfile
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from appearance_opt.errors import InputError
+from appearance_opt.fit import archive
 from appearance_opt.fit.loop import FitOptions, fit
 from appearance_opt.fit.model import Model, Rates
 from appearance_opt.fit.validation import Validation
@@ -32,6 +30,9 @@ from appearance_opt.reference.pool import ReferencePool
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+    from pathlib import Path
+
+    from numpy.typing import NDArray
 
     from appearance_opt.config import SimplifyOptions
     from appearance_opt.fit.loop import Progress
@@ -90,36 +91,24 @@ def grown(
     return transferred(source, unwrap(positions, faces, options.texture_size), options), result.interrupted
 
 
-def kept(path: Path, make: Callable[[], tuple[Start, bool]]) -> tuple[Start, bool]:
-    """A start from ``path``, or made and written there: a resumed fit must go on from the very same one."""
+def kept(path: Path, fingerprint: str, make: Callable[[], tuple[Start, bool]]) -> tuple[Start, bool]:
+    """A start from ``path``, or made and written there: a resumed fit must go on from the very same one. Raises
+    InputError when what is there is damaged or belongs to a job of another ``fingerprint``."""
     if path.exists():
         try:
-            return _read(path), False
-        except (OSError, KeyError, ValueError, EOFError) as error:
+            return _start(archive.read(path, fingerprint)), False
+        except archive.UNREADABLE as error:
             raise InputError(f"{path}: not a usable start ({error}); delete it to begin anew") from error
     start, interrupted = make()
-    _write(path, start)
+    arrays = {name: getattr(start.mesh, name) for name in _MESH}
+    arrays.update({f"map/{name}": np.asarray(value) for name, value in start.maps.items()})
+    archive.write(path, fingerprint, {**arrays, "known": start.known})
     return start, interrupted
 
 
 _MESH = ("positions", "faces", "frame_vertex", "frame_faces", "uvs")
 
 
-def _write(path: Path, start: Start) -> None:
-    arrays = {name: getattr(start.mesh, name) for name in _MESH}
-    arrays.update({f"map/{name}": np.asarray(value) for name, value in start.maps.items()})
-    with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".tmp", delete=False) as file:
-        try:
-            np.savez(file, allow_pickle=False, known=start.known, **arrays)
-            file.flush()
-            os.replace(file.name, path)
-        except BaseException:
-            Path(file.name).unlink(missing_ok=True)
-            raise
-
-
-def _read(path: Path) -> Start:
-    with np.load(path) as file:
-        arrays = {k: file[k] for k in file.files}
+def _start(arrays: dict[str, NDArray]) -> Start:
     maps = {k[4:]: v if v.ndim else float(v) for k, v in arrays.items() if k.startswith("map/")}
     return Start(LatentMesh(*(arrays[name] for name in _MESH)), maps, True, arrays["known"])

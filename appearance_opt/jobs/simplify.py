@@ -174,13 +174,18 @@ class _Job:
                 o,
                 triangles,
                 None if seconds is None else SHARE * seconds,
-                None if steps is None else max(1, round(SHARE * steps)),
+                None if steps is None else round(SHARE * steps),
                 self.progress,
             )
 
-        start, interrupted = make() if self.checkpointer is None else kept(self.checkpointer.start_path, make)
+        if self.checkpointer is None:
+            start, interrupted = make()
+        else:
+            start, interrupted = kept(self.checkpointer.start_path, self.checkpointer.fingerprint, make)
         if interrupted:  # Ctrl-C ends both fits
             self.options = with_values(o, steps=0)
+        elif steps is not None:
+            self.options = with_values(o, steps=steps - round(SHARE * steps))
         return start
 
     def fit(self) -> SimplifyResult:
