@@ -70,6 +70,27 @@ def _version(show: bool) -> None:
         raise SystemExit(0)
 
 
+# options that mean the same in several commands
+PresetOption = Annotated[str | None, typer.Option(help="draft, default or final.")]
+TextureSizeOption = Annotated[int | None, typer.Option(help="Texels per side of the maps (power of two).")]
+ResolutionOption = Annotated[int | None, typer.Option(help="Pixels per side of a training view.")]
+ViewsOption = Annotated[int | None, typer.Option(help="Views per step.")]
+PoolOption = Annotated[int | None, typer.Option(help="Reference views rendered, each used many times.")]
+StepsOption = Annotated[int | None, typer.Option(help="Stop after this many steps.")]
+BudgetOption = Annotated[str | None, typer.Option(help="Wall-clock time for everything: 60s, 5m.")]
+NormalRateOption = Annotated[float | None, typer.Option(help="Learning rate of the normal map.")]
+ColorRateOption = Annotated[float | None, typer.Option(help="Learning rate of the base colour.")]
+MaterialRateOption = Annotated[float | None, typer.Option(help="Learning rate of roughness, metalness.")]
+BackgroundOption = Annotated[str | None, typer.Option(help="random, black, white, grey or r,g,b.")]
+LightOption = Annotated[str | None, typer.Option(help="point (random) or headlight.")]
+SeedOption = Annotated[int | None, typer.Option(help="Seed of views and lights.")]
+RefineOption = Annotated[int | None, typer.Option(help="Level to which USD subdivision surfaces are refined.")]
+DeviceOption = Annotated[str | None, typer.Option(help="auto, cpu or cuda.")]
+ReportOption = Annotated[Path | None, typer.Option(help="Folder for the report [OUT's name + .report].")]
+NoReportOption = Annotated[bool, typer.Option("--no-report", help="Write no report.")]
+ConfigOption = Annotated[Path | None, typer.Option(help="TOML file with the same keys.")]
+
+
 @app.callback()
 def _root(
     version: Annotated[
@@ -85,13 +106,13 @@ def simplify(
     out: Annotated[Path, typer.Option(help="Result: .glb .gltf .usd* .obj")],
     triangles: Annotated[int | None, typer.Option(help="At most this many triangles.")] = None,
     ratio: Annotated[float | None, typer.Option(help="Fraction of the input's triangles instead.")] = None,
-    preset: Annotated[str | None, typer.Option(help="draft, default or final.")] = None,
-    texture_size: Annotated[int | None, typer.Option(help="Texels per side of the maps (power of two).")] = None,
-    resolution: Annotated[int | None, typer.Option(help="Pixels per side of a training view.")] = None,
-    views: Annotated[int | None, typer.Option(help="Views per step.")] = None,
-    pool: Annotated[int | None, typer.Option(help="Reference views rendered, each used many times.")] = None,
-    steps: Annotated[int | None, typer.Option(help="Stop after this many steps.")] = None,
-    budget: Annotated[str | None, typer.Option(help="Wall-clock time for everything: 60s, 5m.")] = None,
+    preset: PresetOption = None,
+    texture_size: TextureSizeOption = None,
+    resolution: ResolutionOption = None,
+    views: ViewsOption = None,
+    pool: PoolOption = None,
+    steps: StepsOption = None,
+    budget: BudgetOption = None,
     fit: Annotated[str | None, typer.Option(help="Subset of shape,normal,material.")] = None,
     init: Annotated[str | None, typer.Option(help="decimate, sphere, or a file to start from.")] = None,
     reallocate: Annotated[int | None, typer.Option(help="Rounds of moving triangles to the image error.")] = None,
@@ -101,26 +122,26 @@ def simplify(
         bool | None, typer.Option("--relative/--absolute", help="Laplacian of the start, or 0.")
     ] = None,
     position_rate: Annotated[float | None, typer.Option(help="In units of the local edge length.")] = None,
-    normal_rate: Annotated[float | None, typer.Option(help="Learning rate of the normal map.")] = None,
-    color_rate: Annotated[float | None, typer.Option(help="Learning rate of the base colour.")] = None,
-    material_rate: Annotated[float | None, typer.Option(help="Learning rate of roughness, metalness.")] = None,
-    background: Annotated[str | None, typer.Option(help="random, black, white, grey or r,g,b.")] = None,
-    light: Annotated[str | None, typer.Option(help="point (random) or headlight.")] = None,
-    seed: Annotated[int | None, typer.Option(help="Seed of views and lights.")] = None,
+    normal_rate: NormalRateOption = None,
+    color_rate: ColorRateOption = None,
+    material_rate: MaterialRateOption = None,
+    background: BackgroundOption = None,
+    light: LightOption = None,
+    seed: SeedOption = None,
     keep_hidden: Annotated[bool | None, typer.Option(help="Keep geometry that nobody sees.")] = None,
     displacement: Annotated[bool | None, typer.Option("--displacement", help="Fit a displacement map.")] = None,
     subdivision: Annotated[str | None, typer.Option(help="Tessellation, 0 to 4: 3, or 1,2,3 for all of them.")] = None,
     displacement_rate: Annotated[float | None, typer.Option(help="In units of the finest edge length.")] = None,
     write_tessellated: Annotated[bool | None, typer.Option("--write-tessellated", help="Write them, too.")] = None,
     normal_map: Annotated[bool | None, typer.Option(help="Make a normal map at all.")] = None,
-    refine: Annotated[int | None, typer.Option(help="Level to which USD subdivision surfaces are refined.")] = None,
+    refine: RefineOption = None,
     variant: Annotated[list[str] | None, typer.Option(help="USD variant: set=name (repeatable).")] = None,
-    device: Annotated[str | None, typer.Option(help="auto, cpu or cuda.")] = None,
-    report: Annotated[Path | None, typer.Option(help="Folder for the report [OUT's name + .report].")] = None,
-    no_report: Annotated[bool, typer.Option("--no-report", help="Write no report.")] = False,
+    device: DeviceOption = None,
+    report: ReportOption = None,
+    no_report: NoReportOption = False,
     checkpoint: Annotated[Path | None, typer.Option(help="Folder for checkpoints.")] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on from the checkpoint.")] = False,
-    config: Annotated[Path | None, typer.Option(help="TOML file with the same keys.")] = None,
+    config: ConfigOption = None,
 ) -> None:
     """Write an asset with fewer triangles that looks like INPUT."""
     arguments = dict(locals())
@@ -166,8 +187,8 @@ def bake(
     ] = None,
     closed_form: Annotated[bool | None, typer.Option("--closed-form", help="Rays alone, no fit: seconds.")] = None,
     fit: Annotated[str | None, typer.Option(help="Subset of normal,material.")] = None,
-    preset: Annotated[str | None, typer.Option(help="draft, default or final.")] = None,
-    texture_size: Annotated[int | None, typer.Option(help="Texels per side of the maps (power of two).")] = None,
+    preset: PresetOption = None,
+    texture_size: TextureSizeOption = None,
     samples: Annotated[int | None, typer.Option(help="Rays per texel.")] = None,
     cage: Annotated[float | None, typer.Option(help="How far rays go, metres [from the two meshes].")] = None,
     hit: Annotated[str | None, typer.Option(help="nearest or outermost surface.")] = None,
@@ -178,30 +199,30 @@ def bake(
     ao_distance: Annotated[float | None, typer.Option(help="Reach of ambient occlusion, metres [any].")] = None,
     unwrap: Annotated[bool | None, typer.Option("--unwrap", help="Make a new atlas for LOW.")] = None,
     align: Annotated[bool | None, typer.Option("--align", help="Fit HIGH to LOW: translation, scale.")] = None,
-    resolution: Annotated[int | None, typer.Option(help="Pixels per side of a training view.")] = None,
-    views: Annotated[int | None, typer.Option(help="Views per step.")] = None,
-    pool: Annotated[int | None, typer.Option(help="Reference views rendered, each used many times.")] = None,
-    steps: Annotated[int | None, typer.Option(help="Stop after this many steps.")] = None,
-    budget: Annotated[str | None, typer.Option(help="Wall-clock time for everything: 60s, 5m.")] = None,
+    resolution: ResolutionOption = None,
+    views: ViewsOption = None,
+    pool: PoolOption = None,
+    steps: StepsOption = None,
+    budget: BudgetOption = None,
     loss: Annotated[str | None, typer.Option(help="As for simplify.")] = None,
-    normal_rate: Annotated[float | None, typer.Option(help="Learning rate of the normal map.")] = None,
-    color_rate: Annotated[float | None, typer.Option(help="Learning rate of the base colour.")] = None,
-    material_rate: Annotated[float | None, typer.Option(help="Learning rate of roughness, metalness.")] = None,
-    background: Annotated[str | None, typer.Option(help="random, black, white, grey or r,g,b.")] = None,
-    light: Annotated[str | None, typer.Option(help="point (random) or headlight.")] = None,
-    seed: Annotated[int | None, typer.Option(help="Seed of views and lights.")] = None,
-    refine: Annotated[int | None, typer.Option(help="Level to which USD subdivision surfaces are refined.")] = None,
+    normal_rate: NormalRateOption = None,
+    color_rate: ColorRateOption = None,
+    material_rate: MaterialRateOption = None,
+    background: BackgroundOption = None,
+    light: LightOption = None,
+    seed: SeedOption = None,
+    refine: RefineOption = None,
     variant: Annotated[list[str] | None, typer.Option(help="USD variant of HIGH: set=name (repeatable).")] = None,
-    device: Annotated[str | None, typer.Option(help="auto, cpu or cuda.")] = None,
+    device: DeviceOption = None,
     joint: Annotated[bool | None, typer.Option("--joint", help="Fit LOW's shape and a displacement, too.")] = None,
     subdivision: Annotated[str | None, typer.Option(help="Tessellation with --joint: 3, or 1,2,3.")] = None,
     position_rate: Annotated[float | None, typer.Option(help="With --joint: as for simplify.")] = None,
     displacement_rate: Annotated[float | None, typer.Option(help="With --joint: as for simplify.")] = None,
     write_tessellated: Annotated[bool | None, typer.Option("--write-tessellated", help="With --joint.")] = None,
     textures: Annotated[Path | None, typer.Option(help="Folder for the maps as loose files.")] = None,
-    report: Annotated[Path | None, typer.Option(help="Folder for the report [OUT's name + .report].")] = None,
-    no_report: Annotated[bool, typer.Option("--no-report", help="Write no report.")] = False,
-    config: Annotated[Path | None, typer.Option(help="TOML file with the same keys.")] = None,
+    report: ReportOption = None,
+    no_report: NoReportOption = False,
+    config: ConfigOption = None,
 ) -> None:
     """Bake what HIGH looks like into the maps of LOW."""
     arguments = dict(locals())
@@ -212,24 +233,31 @@ def bake(
     name = preset or values.get("preset") or "default"
     values.pop("preset", None)
     options = bake_options(name, **values)
-    from appearance_opt.asset import load
     from appearance_opt.jobs.bake import bake as run
-    from appearance_opt.jobs.simplify import check_paths
     from appearance_opt.progress import TerminalProgress
 
-    for source in (high, low):
-        check_paths(source, out)
-    heavy = load(high, refine=options.refine, variants=_variants(variant))
     folder = None if no_report else report or out.with_name(out.stem + ".report")
     if options.joint:
         from appearance_opt.jobs.joint import joint as run_joint
 
         with TerminalProgress() as progress:
-            joined = run_joint(heavy, low, out, options, report=folder, progress=progress, began=BEGAN)
+            joined = run_joint(
+                high, low, out, options, report=folder, progress=progress, variants=_variants(variant), began=BEGAN
+            )
         _print_result(out, joined, folder)
         return
     with TerminalProgress() as progress:
-        result = run(heavy, low, out, options, report=folder, textures=textures, progress=progress, began=BEGAN)
+        result = run(
+            high,
+            low,
+            out,
+            options,
+            report=folder,
+            textures=textures,
+            progress=progress,
+            variants=_variants(variant),
+            began=BEGAN,
+        )
     for note in result.notes:
         print(f"note: {note}", file=sys.stderr)
     quality = ""

@@ -42,7 +42,7 @@ def test_smoothing_inverts_the_laplacian_system(smoother: Smoother) -> None:
     for a, b in pairs:
         back[a] += 3 * (smooth[a] - smooth[b])
         back[b] += 3 * (smooth[b] - smooth[a])
-    np.testing.assert_allclose(back, mesh.positions, atol=2e-6)  # measured 3e-7: results are stored in single precision
+    np.testing.assert_allclose(back, mesh.positions, atol=2e-6)  # measured 4.5e-7: stored in single precision
 
 
 def test_smoothing_keeps_translations_and_is_its_own_adjoint(smoother: Smoother) -> None:
@@ -69,10 +69,10 @@ def test_preconditioned_steps_move_neighbours_together(smoother: Smoother) -> No
 def test_a_grown_sphere_becomes_the_object(ball: Asset) -> None:
     result = simplify(ball, None, options(steps=120))
     assert result.triangles <= 200
-    # a random start of half the size; measured 24.5 dB after 42 + 78 steps
+    # a random start of half the size; measured 23.7 to 25.2 dB over three seeds, 42 + 78 steps
     assert appearance_opt.compare(ball, result.asset, views=3, resolution=64).metrics.psnr_covered > 20
     extent = np.ptp(result.asset.meshes[0].positions, axis=0)
-    np.testing.assert_allclose(extent, 2.0, atol=0.15)
+    np.testing.assert_allclose(extent, 2.0, atol=0.1)  # measured 0.03 at most
 
 
 def test_a_resumed_growth_goes_on_from_the_same_start(ball: Asset, tmp_path: Path) -> None:

@@ -16,8 +16,8 @@ def unwrap(
     positions: NDArray, faces: NDArray, resolution: int, gutter: int = GUTTER, tight: bool = False
 ) -> LatentMesh:
     """Charts for all faces, packed into the unit square for a texture of ``resolution`` texels, ``gutter``
-    of them empty between charts. ``tight`` searches all places for each chart: 5 to 25 % more texels per area, for
-    one to three seconds.
+    of them empty between charts. ``tight`` searches all places for each chart: up to a quarter more texels
+    per area, for one or two seconds.
 
     glTF convention (v downward). Render vertices are also split where a vertex lies on charts of both
     handednesses, so that each has one tangent frame.

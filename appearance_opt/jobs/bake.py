@@ -61,6 +61,7 @@ def bake(
     report: str | Path | None = None,
     textures: str | Path | None = None,
     progress: Progress | None = None,
+    variants: dict[str, str] | None = None,
     began: float | None = None,
 ) -> BakeResult:
     """Bake ``high`` to ``low`` (paths or assets) and write LOW with its new maps to ``out`` (None: do not write).
@@ -69,13 +70,13 @@ def bake(
     maps for which the format of ``out`` has no place are always written, by default to ``<out's stem>_maps``.
     Raises AppearanceError.
     """
-    from appearance_opt.jobs.fitting import Stopwatch, optional_report
+    from appearance_opt.jobs.fitting import Stopwatch, conclude
     from appearance_opt.jobs.simplify import check_paths
 
     watch = Stopwatch(began)
     for source in (high, low):
         check_paths(source, out, report)
-    heavy = load(high, refine=options.refine) if isinstance(high, (str, Path)) else high
+    heavy = load(high, refine=options.refine, variants=variants) if isinstance(high, (str, Path)) else high
     light = load(low, refine=options.refine) if isinstance(low, (str, Path)) else low
     watch.lap("load")
     run = BakeJob(heavy, light, str(low) if isinstance(low, (str, Path)) else light.name, options, watch)
@@ -86,14 +87,14 @@ def bake(
         watch.lap("write")
     if error is not None:
         raise error
-    if report is not None:
-        result.seconds = dict(watch.stages)
-        with optional_report(result.notes):
-            from appearance_opt.jobs.report import write_bake_report
 
-            write_bake_report(Path(report), run.high, result, run.sampler, run.frame, options)
-        watch.lap("report")
-    result.seconds = {**watch.stages, "total": watch.total}
+    def write_report() -> None:
+        from appearance_opt.jobs.report import write_bake_report
+
+        assert report is not None
+        write_bake_report(Path(report), run.high, result, run.sampler, run.frame, options)
+
+    conclude(result, watch, None if report is None else write_report)
     return result
 
 

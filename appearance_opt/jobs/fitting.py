@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
-from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
@@ -19,7 +18,7 @@ from appearance_opt.reference.pool import ReferencePool
 from appearance_opt.render.gradient import Quality
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable
 
     from numpy.typing import NDArray
 
@@ -67,13 +66,24 @@ class Stopwatch:
         return time.perf_counter() - self.began
 
 
-@contextmanager
-def optional_report(notes: list[str]) -> Iterator[None]:
-    """A Ctrl-C while a report is made ends the report alone: the result is written already."""
-    try:
-        yield
-    except KeyboardInterrupt:
-        notes.append("interrupted while the report was made: the result is complete, the report is missing")
+class Timed(Protocol):
+    """What the results of all jobs have."""
+
+    seconds: dict[str, float]
+    notes: list[str]
+
+
+def conclude(result: Timed, watch: Stopwatch, write_report: Callable[[], None] | None) -> None:
+    """Write the report, if there is to be one, and note the time of every stage. The result is written already: a
+    Ctrl-C from here on, the imports of the report included, ends the report alone."""
+    if write_report is not None:
+        result.seconds = dict(watch.stages)
+        try:
+            write_report()
+        except KeyboardInterrupt:
+            result.notes.append("interrupted while the report was made: the result is complete, the report is missing")
+        watch.lap("report")
+    result.seconds = {**watch.stages, "total": watch.total}
 
 
 def fit_start(

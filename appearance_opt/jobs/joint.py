@@ -28,6 +28,7 @@ def joint(
     *,
     report: str | Path | None = None,
     progress: Progress | None = None,
+    variants: dict[str, str] | None = None,
     began: float | None = None,
 ) -> SimplifyResult:
     """Fit base shape, displacement, normals and material of ``low`` to ``high`` and write the result to ``out``
@@ -35,12 +36,12 @@ def joint(
     is represented best. Raises AppearanceError."""
     from appearance_opt.jobs.bake import BakeJob
     from appearance_opt.jobs.displaced import require_memory, write_companion, write_levels
-    from appearance_opt.jobs.fitting import Stopwatch, optional_report
+    from appearance_opt.jobs.fitting import Stopwatch, conclude
 
     watch = Stopwatch(began)
     for source in (high, low):
         check_paths(source, out, report)
-    heavy = load(high, refine=options.refine) if isinstance(high, (str, Path)) else high
+    heavy = load(high, refine=options.refine, variants=variants) if isinstance(high, (str, Path)) else high
     light = load(low, refine=options.refine) if isinstance(low, (str, Path)) else low
     require_memory(light.triangle_count, options)
     watch.lap("load")
@@ -54,14 +55,14 @@ def joint(
         watch.lap("write")
     if result.error is not None:
         raise result.error
-    if report is not None:
-        result.seconds = dict(watch.stages)
-        with optional_report(result.notes):
-            from appearance_opt.jobs.report import write_simplify_report
 
-            write_simplify_report(Path(report), job.high, result, job.sampler, job.frame, options)
-        watch.lap("report")
-    result.seconds = {**watch.stages, "total": watch.total}
+    def write_report() -> None:
+        from appearance_opt.jobs.report import write_simplify_report
+
+        assert report is not None
+        write_simplify_report(Path(report), job.high, result, job.sampler, job.frame, options)
+
+    conclude(result, watch, None if report is None else write_report)
     return result
 
 

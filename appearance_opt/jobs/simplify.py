@@ -73,7 +73,7 @@ def simplify(
     writes the best state so far; once the result is written it ends the report. Raises AppearanceError.
     """
     from appearance_opt.jobs.displaced import write_companion, write_levels
-    from appearance_opt.jobs.fitting import Stopwatch, optional_report
+    from appearance_opt.jobs.fitting import Stopwatch, conclude
 
     watch = Stopwatch(began)
     check_paths(source, out, report, checkpoint)
@@ -91,14 +91,14 @@ def simplify(
         watch.lap("write")
     if result.error is not None:
         raise result.error
-    if report is not None:
-        result.seconds = dict(watch.stages)
-        with optional_report(result.notes):
-            from appearance_opt.jobs.report import write_simplify_report
 
-            write_simplify_report(Path(report), asset, result, run.sampler, run.frame, options)
-        watch.lap("report")
-    result.seconds = {**watch.stages, "total": watch.total}
+    def write_report() -> None:
+        from appearance_opt.jobs.report import write_simplify_report
+
+        assert report is not None
+        write_simplify_report(Path(report), asset, result, run.sampler, run.frame, options)
+
+    conclude(result, watch, None if report is None else write_report)
     return result
 
 

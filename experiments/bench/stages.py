@@ -35,16 +35,14 @@ def main() -> None:
         print(f"| {name} | {value:.1f} | {large[name]:.1f} |")
 
 
-def stages(resolution: int, maps: int) -> dict[str, float]:
-    """Median milliseconds of each stage."""
-    source, model, sampler = set_up(3000, 100_000, maps)
-    grid, quality = Grid(4, resolution), Quality(1.0, 4, 1)
-    records = sampler.draw(0, 4).records()
-    reference = source.render_device(records, grid, 1)
-    edges = model.topology.edges
-    out: dict[str, float] = {}
+class Stopwatch:
+    """Median ``milliseconds`` of named stages."""
 
-    def timed(name: str, work: Callable[[], object]) -> object:
+    def __init__(self) -> None:
+        self.milliseconds: dict[str, float] = {}
+
+    def timed(self, name: str, work: Callable[[], object]) -> object:
+        """Time ``work`` several times, the device idle before and after; returns its last result."""
         times = []
         for _ in range(REPEATS):
             dr.sync_thread()
@@ -53,8 +51,19 @@ def stages(resolution: int, maps: int) -> dict[str, float]:
             dr.eval(result)
             dr.sync_thread()
             times.append(1e3 * (time.perf_counter() - began))
-        out[name] = float(np.median(times[3:]))
+        self.milliseconds[name] = float(np.median(times[3:]))
         return result
+
+
+def stages(resolution: int, maps: int) -> dict[str, float]:
+    """Median milliseconds of each stage."""
+    source, model, sampler = set_up(3000, 100_000, maps)
+    grid, quality = Grid(4, resolution), Quality(1.0, 4, 1)
+    records = sampler.draw(0, 4).records()
+    reference = source.render_device(records, grid, 1)
+    edges = model.topology.edges
+    stopwatch = Stopwatch()
+    timed = stopwatch.timed
 
     timed("reference image, rendered live, 1 sample", lambda: source.render_device(records, grid, 1))
 
@@ -107,7 +116,7 @@ def stages(resolution: int, maps: int) -> dict[str, float]:
     moments = {n: adam.moments_of(p) for n, p in model.parameters.items()}
     timed("Adam, texels", lambda: adam.update(parameter, down, moments[TEXELS], 1.0)[0])
     timed("Adam, positions", lambda: adam.update(model.parameters[POSITIONS], grads[0], moments[POSITIONS], 1.0)[0])
-    return out
+    return stopwatch.milliseconds
 
 
 if __name__ == "__main__":
