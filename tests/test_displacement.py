@@ -10,7 +10,7 @@ import pytest
 from appearance_opt.asset.normals import weld
 from appearance_opt.fit.losses import LOSSES
 from appearance_opt.fit.model import POSITIONS, TEXELS, Model, Rates
-from appearance_opt.fit.step import StepInputs, gradients
+from appearance_opt.fit.step import Gradients, StepInputs
 from appearance_opt.initial.sphere import sphere
 from appearance_opt.latent.displacement import DISPLACEMENT, Tessellator, footprint, share
 from appearance_opt.latent.subdivision import tessellate
@@ -212,7 +212,7 @@ def test_derivatives_of_the_image(of: str) -> None:
     quality = Quality(0.0, 1, 4)
 
     def run() -> tuple[float, dict]:
-        loss, grads = gradients(model, grid, quality, LOSSES["l2"], None, inputs)
+        loss, grads = Gradients(model, grid, quality, LOSSES["l2"], freeze=False)(inputs)
         return float(loss[0]), grads
 
     slope = np.array(run()[1][of]).astype(np.float64)

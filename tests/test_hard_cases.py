@@ -13,7 +13,7 @@ from conftest import grid_sphere, make_asset
 from appearance_opt.asset.types import Asset, Material, Mesh, Texture
 from appearance_opt.fit.losses import LOSSES
 from appearance_opt.fit.model import POSITIONS, TEXELS, Model, Rates
-from appearance_opt.fit.step import StepInputs, gradients
+from appearance_opt.fit.step import Gradients, StepInputs
 from appearance_opt.initial.sphere import sphere
 from appearance_opt.latent.latent import LatentMesh
 from appearance_opt.reference.mesh import MeshReference
@@ -58,7 +58,7 @@ def check(
     target[: grid.pixels // 2] = (0.2, 0.3, 0.4, 1.0)
     background = np.full((len(views), 3), 0.4, np.float32)
     inputs = StepInputs(views, Targets(mi.Float(target.ravel())), background, 0.0, 1.0, 3)
-    value, grads = gradients(model, grid, quality, LOSSES[loss], None, inputs)
+    value, grads = Gradients(model, grid, quality, LOSSES[loss], freeze=False)(inputs)
     surface, maps = model.surface(model.positions()), model.maps(model.fitted_layer())
     image = np.array(render_image(model.scene, surface, maps, views.records(), grid, 4))
     assert np.isfinite(image).all() and (image >= 0).all()
@@ -213,7 +213,7 @@ def test_edges_whose_third_corner_lies_behind_the_camera_push_outwards() -> None
         1.0,
         1,
     )
-    _, grads = gradients(model, grid, Quality(8.0, 4, 1), LOSSES["l1"], None, inputs)
+    _, grads = Gradients(model, grid, Quality(8.0, 4, 1), LOSSES["l1"], freeze=False)(inputs)
     g = np.array(grads[POSITIONS]).reshape(-1, 3)
     # the background is white and wrong: raising either end of the far edge (y up) must lower the loss
     assert g[0, 1] < 0 and g[1, 1] < 0

@@ -16,7 +16,7 @@ from appearance_opt.fit.laplacian import Laplacian
 from appearance_opt.fit.losses import loss_of_name
 from appearance_opt.fit.model import POSITIONS, Model
 from appearance_opt.fit.schedule import Clock, laplacian_weight, learning_rate
-from appearance_opt.fit.step import StepInputs, first_non_finite, step
+from appearance_opt.fit.step import Gradients, StepInputs, first_non_finite, step
 from appearance_opt.fit.validation import Validation
 from appearance_opt.latent.displacement import DISPLACEMENT
 from appearance_opt.latent.latent import local_edge_length
@@ -141,6 +141,7 @@ class _Run:
             self.laplacians = laplacians(model, options.relative)
         if checkpointer is not None and checkpointer.restore(model, self.state):
             self.result.curve = [CurvePoint(*p) for p in self.state.curve]
+        self.gradients = Gradients(model, self.grid, self.quality, self.loss, self.laplacians)
         self.clock = Clock(options.steps, options.seconds, self.state.seconds)
         self.bad_steps = 0
         self.psnr = self.state.best_psnr
@@ -154,7 +155,6 @@ class _Run:
         fraction = self.clock.progress(state.iteration)
         views, reference = self.pool.draw(state.iteration)
         self.model.select(level_of(self.model.levels, options.seed, state.iteration))
-        laplacian = self.laplacians.get(self.model.level)
         inputs = StepInputs(
             views=views,
             reference=reference,
@@ -164,11 +164,11 @@ class _Run:
             seed=state.iteration,
             want_loss=state.iteration % LOSS_EVERY == 0 or state.laplacian == 0,
         )
-        done = step(self.model, state.moments, self.grid, self.quality, self.loss, laplacian, inputs, first_non_finite)
+        done = step(self.gradients, state.moments, inputs, first_non_finite)
         self._count(done.bad)
         if done.bad is None and done.loss is not None:
             state.loss = done.loss
-            if state.laplacian == 0 and laplacian is not None:
+            if state.laplacian == 0 and self.model.level in self.laplacians:
                 # a deviation of a tenth of an edge length costs this fraction of the first image loss
                 state.laplacian = options.laplacian * done.loss / 0.01
         state.iteration += 1

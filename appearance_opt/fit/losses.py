@@ -6,16 +6,22 @@ the caller.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
+from appearance_opt.backend import to_device
 from appearance_opt.errors import InputError
+from appearance_opt.render.gradient import backward
 from appearance_opt.render.math import at_least, at_most
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+
+    from numpy.typing import NDArray
 
     Loss = Callable[[mi.Color3f, mi.Color3f], mi.Color3f]
 
@@ -96,57 +102,63 @@ def loss_of_name(name: str) -> Loss:
     return LOSSES[name]
 
 
-def covered_loss(
-    loss: Loss,
-    color: mi.Color3f,
-    pixel: mi.UInt32,
-    reference: mi.Float,
-    background: mi.Float,
-    pixels_per_view: int | mi.UInt32,
-) -> mi.Float:
+@dataclass(frozen=True)
+class Target:
+    """What a batch of images is compared with: ``reference`` (pixels * 4) premultiplied linear RGB and coverage;
+    ``background`` (views * 4) linear RGB and padding, the colour behind each view; ``pixels_per_view``; ``share``: of
+    one channel of a pixel in the mean over all."""
+
+    reference: mi.Float
+    background: mi.Float
+    pixels_per_view: mi.UInt32
+    share: mi.Float
+
+    @classmethod
+    def of(cls, reference: mi.Float, background: NDArray) -> Target:
+        """The target of reference images before a background (views, 3)."""
+        pixels = dr.width(reference) // 4
+        padded = np.concatenate([background, np.zeros((len(background), 1))], axis=1)
+        per_view = dr.opaque(mi.UInt32, pixels // len(background))
+        return cls(reference, to_device(padded), per_view, dr.opaque(mi.Float, 1 / (3 * pixels)))
+
+    def colors(self, pixel: mi.UInt32) -> tuple[mi.Color3f, mi.Color3f]:
+        """(reference composited over its background, background) of pixels."""
+        count = dr.width(pixel)
+        b = dr.gather(mi.ArrayXf, self.background, pixel // self.pixels_per_view, shape=(4, count))
+        behind = mi.Color3f(b[0], b[1], b[2])
+        return _over(dr.gather(mi.ArrayXf, self.reference, pixel, shape=(4, count)), behind), behind
+
+
+def covered_loss(loss: Loss, target: Target, color: mi.Color3f, pixel: mi.UInt32) -> mi.Float:
     """Share of the mean loss of a batch that falls on fully covered pixels of radiance ``color``, one value per
-    pixel, differentiable. The other arguments as for ``image_loss``."""
-    count = dr.width(pixel)
-    behind = dr.gather(mi.ArrayXf, background, pixel // pixels_per_view, shape=(4, count))
-    target = dr.gather(mi.ArrayXf, reference, pixel, shape=(4, count))
-    per_pixel = loss(color, _over(target, mi.Color3f(behind[0], behind[1], behind[2])))
-    scale = dr.opaque(mi.Float, 4 / (3 * dr.width(reference)))
-    return (per_pixel.x + per_pixel.y + per_pixel.z) * scale
+    pixel, differentiable."""
+    return _summed(loss(color, target.colors(pixel)[0])) * target.share
 
 
-def image_loss(
-    loss: Loss,
-    image: mi.Float,
-    reference: mi.Float,
-    background: mi.Float,
-    pixels_per_view: int | mi.UInt32,
-    complete: mi.Bool | None = None,
-) -> tuple[mi.Float, mi.Float]:
-    """Mean loss over a batch, and its derivative by the image.
+def compared_pixels(image: mi.Float, target: Target, complete: mi.Bool | None = None) -> mi.UInt32:
+    """Indices of the pixels of an image (pixels * 4) that can differ from the target: where neither is covered both
+    show the background. ``complete``: (pixels,) pixels to look at (all)."""
+    i = dr.arange(mi.UInt32, dr.width(image) // 4)
+    either = (dr.gather(mi.Float, image, 4 * i + 3) > 0) | (dr.gather(mi.Float, target.reference, 4 * i + 3) > 0)
+    return dr.compress(either if complete is None else either & complete)
 
-    ``image``, ``reference``: (pixels * 4) premultiplied linear RGB and coverage. ``background``:
-    (views * 4) linear RGB and padding, the colour behind each view. ``complete``: (pixels,) pixels to look at
-    (all). Returns (width-1 loss, gradient as wide as ``image``).
-    """
-    total = dr.width(image) // 4
-    i = dr.arange(mi.UInt32, total)
-    # where neither image is covered both show the background: no loss, no gradient, no work
-    either = (dr.gather(mi.Float, image, 4 * i + 3) > 0) | (dr.gather(mi.Float, reference, 4 * i + 3) > 0)
-    i = dr.compress(either if complete is None else either & complete)
-    count = dr.width(i)
-    gradient = dr.zeros(mi.Float, total * 4)
-    if count == 0:
-        return mi.Float(0), gradient
-    behind = dr.gather(mi.ArrayXf, background, i // pixels_per_view, shape=(4, count))
-    target = dr.gather(mi.ArrayXf, reference, i, shape=(4, count))
-    value = dr.gather(mi.ArrayXf, dr.detach(image), i, shape=(4, count))
+
+def image_loss(loss: Loss, target: Target, image: mi.Float, pixels: mi.UInt32, total: int) -> tuple[mi.Float, mi.Float]:
+    """Loss of some ``pixels`` (indices, at least one) of an image of ``total`` pixels (premultiplied linear RGB and
+    coverage), and its derivative by the image. Returns (values, one per entry of ``pixels``, whose sum is their share
+    of the mean over all pixels; gradient as wide as ``image``)."""
+    value = dr.gather(mi.ArrayXf, dr.detach(image), pixels, shape=(4, dr.width(pixels)))
     dr.enable_grad(value)
-    b = mi.Color3f(behind[0], behind[1], behind[2])
-    per_pixel = loss(_over(value, b), _over(target, b))
-    mean = dr.sum(per_pixel.x + per_pixel.y + per_pixel.z) * dr.opaque(mi.Float, 1 / (3 * total))
-    dr.backward(mean)
-    dr.scatter(gradient, dr.grad(value), i, mode=dr.ReduceMode.Permute)
-    return dr.detach(mean), gradient
+    reference, behind = target.colors(pixels)
+    share = _summed(loss(_over(value, behind), reference)) * target.share
+    backward([share])
+    gradient = dr.zeros(mi.Float, total * 4)
+    dr.scatter(gradient, dr.grad(value), pixels, mode=dr.ReduceMode.Permute)
+    return dr.detach(share), gradient
+
+
+def _summed(color: mi.Color3f) -> mi.Float:
+    return color.x + color.y + color.z
 
 
 def _over(premultiplied: mi.ArrayXf, background: mi.Color3f) -> mi.Color3f:

@@ -186,30 +186,40 @@ class Model:
         return self.parameters[POSITIONS].value if POSITIONS in self.parameters else self._fixed_positions
 
     def shape(self) -> Shape:
-        """Copies of what places the drawn mesh; those that are parameters can be differentiated."""
+        """What places the drawn mesh, as it is now."""
+        return self.shape_of(self.values())
+
+    def shape_of(self, values: Mapping[str, mi.Float]) -> Shape:
+        """What places the drawn mesh, for given values of the parameters."""
         relief = self._fixed_relief
-        if DISPLACEMENT in self.parameters:
+        if DISPLACEMENT in values:
             assert self._relief_codec is not None
-            relief = self._relief_codec.layer(self.parameters[DISPLACEMENT].value)
-        return Shape(mi.Float(self.positions()), relief)
+            relief = self._relief_codec.layer(values[DISPLACEMENT])
+        return Shape(values.get(POSITIONS, self._fixed_positions), relief)
 
-    def track(self, shape: Shape) -> Shape:
-        """Attach gradients to those parts of a shape that are parameters."""
+    def layer_of(self, values: Mapping[str, mi.Float]) -> TexelLayer | None:
+        """The maps that are parameters as a pyramid, for given values."""
+        return self.codec.layer(values[TEXELS]) if self.codec is not None else None
+
+    def track(self, shape: Shape, layer: TexelLayer | None) -> tuple[Shape, TexelLayer | None]:
+        """Copies with gradients attached to those parts that are parameters."""
+        positions, relief = mi.Float(shape.positions), shape.relief
         if POSITIONS in self.parameters:
-            dr.enable_grad(shape.positions)
-        if DISPLACEMENT in self.parameters and shape.relief is not None:
-            dr.enable_grad(shape.relief.pyramid.texels)
-        return shape
+            dr.enable_grad(positions)
+        if DISPLACEMENT in self.parameters and relief is not None:
+            relief = _tracked(relief)
+        return Shape(positions, relief), None if layer is None else _tracked(layer)
 
-    def shape_gradients(self, shape: Shape) -> dict[str, mi.Float]:
-        """Gradients of the parameters of a tracked shape, after the backward pass."""
+    def gradients(self, shape: Shape, layer: TexelLayer | None, values: Mapping[str, mi.Float]) -> dict[str, mi.Float]:
+        """Gradients of the parameters, which have the given ``values``, after the backward pass of a tracked shape
+        and layer."""
         out = {}
-        if POSITIONS in self.parameters:
+        if POSITIONS in values:
             out[POSITIONS] = dr.grad(shape.positions)
-        if DISPLACEMENT in self.parameters:
-            assert shape.relief is not None and self._relief_codec is not None
-            gradient = dr.grad(shape.relief.pyramid.texels)
-            out[DISPLACEMENT] = self._relief_codec.pull_back(gradient, self.parameters[DISPLACEMENT].value)
+        for name, codec, tracked in ((DISPLACEMENT, self._relief_codec, shape.relief), (TEXELS, self.codec, layer)):
+            if name in values:
+                assert codec is not None and tracked is not None
+                out[name] = codec.pull_back(dr.grad(tracked.pyramid.texels), values[name])
         return out
 
     def posed(self) -> mi.Float:
@@ -227,7 +237,12 @@ class Model:
 
     def fitted_layer(self) -> TexelLayer | None:
         """The maps that are parameters, as a fresh pyramid."""
-        return self.codec.layer(self.parameters[TEXELS].value) if self.codec is not None else None
+        return self.layer_of(self.values())
+
+    def fixed(self) -> tuple:
+        """What a step reads and no step changes."""
+        codecs = self.codec, self._relief_codec
+        return (self._drawn, *codecs, self._fixed_layers, self._fixed_relief, self._fixed_positions)
 
     def maps(self, fitted: TexelLayer | None) -> MaterialMaps:
         """All maps, with the given state of the fitted ones."""
@@ -275,6 +290,13 @@ class Model:
             self.parameters[name].value = mi.Float(value)
         dr.eval([p.value for p in self.parameters.values()])
         self.update_scene()
+
+
+def _tracked(layer: TexelLayer) -> TexelLayer:
+    """A copy whose texels carry gradients."""
+    texels = mi.Float(layer.pyramid.texels)
+    dr.enable_grad(texels)
+    return layer.with_texels(texels)
 
 
 def _group(channel: str) -> str:

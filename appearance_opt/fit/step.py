@@ -2,27 +2,30 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from appearance_opt.backend import to_device
 from appearance_opt.fit import adam
-from appearance_opt.fit.losses import covered_loss, image_loss
-from appearance_opt.fit.model import TEXELS, Model
+from appearance_opt.fit.losses import Target, compared_pixels, covered_loss, image_loss
 from appearance_opt.render import gradient
+from appearance_opt.render.freezing import Frozen, traced
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Mapping
 
     from appearance_opt.fit.laplacian import Laplacian
     from appearance_opt.fit.losses import Loss
+    from appearance_opt.fit.model import Model, Shape
     from appearance_opt.reference.pool import Targets
     from appearance_opt.render.deferred import Grid
+    from appearance_opt.render.freezing import Run
     from appearance_opt.render.gradient import Quality
+    from appearance_opt.render.material import TexelLayer
+    from appearance_opt.render.surface import Surface
     from appearance_opt.views import Views
 
 
@@ -50,66 +53,123 @@ class StepResult:
     bad: str | None
 
 
-def gradients(
-    model: Model, grid: Grid, quality: Quality, loss: Loss, laplacian: Laplacian | None, inputs: StepInputs
-) -> tuple[mi.Float, dict[str, mi.Float]]:
-    """Mean image loss (width 1; only part of it without ``want_loss``) and the gradient of every parameter."""
-    records = inputs.views.records()
-    layer = model.fitted_layer()
-    shape = model.track(model.shape())
-    posed = model.drawn.pose(shape)
-    moving = dr.grad_enabled(posed)
-    surface = model.surface(posed)
-    if layer is not None:
-        dr.enable_grad(layer.pyramid.texels)
-    maps = model.maps(layer)
-    edges = model.topology.edges
-    frame = gradient.render(model.scene, surface, maps, edges, records, grid, quality, inputs.seed, defer=True)
-    behind = np.concatenate([inputs.background, np.zeros((len(inputs.background), 1))], axis=1)
-    background = to_device(behind)
-    per_view = dr.opaque(mi.UInt32, grid.resolution**2)
+class Gradients:
+    """The gradients of a model, as a function of the views and images of a step.
 
-    average = inputs.reference.average
-    points = average if inputs.reference.points is None else inputs.reference.points
+    ``laplacians``: the regularizer of each tessellation level, if any. ``freeze``: record the kernels of the first
+    steps and launch them again without tracing (see ``render.freezing``); results are the same to rounding.
+    """
 
-    def pixel_loss(color: mi.Color3f, pixel: mi.UInt32) -> mi.Float:
-        return covered_loss(loss, color, pixel, points, background, per_view)
+    def __init__(
+        self,
+        model: Model,
+        grid: Grid,
+        quality: Quality,
+        loss: Loss,
+        laplacians: Mapping[int, Laplacian] | None = None,
+        freeze: bool = True,
+    ) -> None:
+        self.model, self.grid, self.quality, self.loss = model, grid, quality, loss
+        self.laplacians = laplacians or {}
+        self._run: Run = Frozen(model.fixed(), self.laplacians, grid) if freeze else traced
 
-    value, by_image = image_loss(loss, frame.image, average, background, per_view, frame.complete())
-    terms = gradient.surrogate(frame, surface, maps, edges, by_image)
-    direct = gradient.direct(frame, surface, maps, pixel_loss)
-    if direct is not None:
-        terms.append(direct)
-    if moving and laplacian is not None:
-        terms.append(laplacian.per_vertex(posed) * dr.opaque(mi.Float, inputs.laplacian_weight))
-    gradient.backward(terms)
-    if direct is not None and inputs.want_loss:
-        value += dr.sum(dr.detach(direct))
-    out = model.shape_gradients(shape)
-    if layer is not None and model.codec is not None:
-        out[TEXELS] = model.codec.pull_back(dr.grad(layer.pyramid.texels), model.parameters[TEXELS].value)
-    dr.eval(value, out)
-    return value, out
+    def __call__(self, inputs: StepInputs) -> tuple[mi.Float | None, dict[str, mi.Float]]:
+        """Mean image loss (width 1; None without ``want_loss``) and the gradient of every parameter."""
+        model, grid, run = self.model, self.grid, self._run
+        records = inputs.views.records()
+        target = Target.of(inputs.reference.average, inputs.background)
+        stored = model.values()
+        with dr.suspend_grad():
+            shape, layer = run(self._unpacked, stored)
+            surface = run(self._surface, model.level, shape)
+        edges = model.topology.edges
+        frame = gradient.render(
+            model.scene, surface, model.maps(layer), edges, records, grid, self.quality, inputs.seed, True, run
+        )
+        # only pixels that are averaged have a gradient here; the value of the loss needs all
+        some = frame.crossed
+        if inputs.want_loss or frame.deferred is None:
+            some = compared_pixels(frame.image, target, frame.complete())
+        averaged, by_image = None, dr.zeros(mi.Float, 4 * grid.pixels)
+        if some is not None and dr.width(some):
+            averaged, by_image = run(image_loss, self.loss, target, frame.image, some, grid.pixels)
+        points = inputs.reference.points
+        direct, out = run(
+            self._pulled_back,
+            model.level,
+            stored,
+            shape,
+            layer,
+            frame,
+            by_image,
+            target if points is None else replace(target, reference=points),
+            dr.opaque(mi.Float, inputs.laplacian_weight),
+            inputs.want_loss,
+        )
+        value = None
+        if inputs.want_loss:
+            value = sum((dr.sum(v) for v in (averaged, direct) if v is not None), mi.Float(0))
+        dr.eval(value, out)
+        return value, out
+
+    def recordings(self) -> int:
+        """Recordings made so far; 0 when nothing is frozen."""
+        return self._run.recordings() if isinstance(self._run, Frozen) else 0
+
+    def _unpacked(self, stored: dict[str, mi.Float]) -> tuple[Shape, TexelLayer | None]:
+        return self.model.shape_of(stored), self.model.layer_of(stored)
+
+    def _surface(self, level: int, shape: Shape) -> Surface:
+        """The surface, without gradients. ``level``: the one that the model draws; each has recordings of its own."""
+        return self.model.surface(self.model.drawn.pose(shape))
+
+    def _pulled_back(
+        self,
+        level: int,
+        stored: dict[str, mi.Float],
+        shape: Shape,
+        layer: TexelLayer | None,
+        frame: gradient.Frame,
+        by_image: mi.Float,
+        target: Target,
+        laplacian_weight: mi.Float,
+        want_loss: bool,
+    ) -> tuple[mi.Float | None, dict[str, mi.Float]]:
+        """(loss of the deferred pixels, gradient of every parameter). ``level``: as in ``_surface``."""
+        model, edges = self.model, self.model.topology.edges
+        shape, layer = model.track(shape, layer)
+        posed = model.drawn.pose(shape)
+        surface, maps = model.surface(posed), model.maps(layer)
+
+        def pixel_loss(color: mi.Color3f, pixel: mi.UInt32) -> mi.Float:
+            return covered_loss(self.loss, target, color, pixel)
+
+        terms = gradient.surrogate(frame, surface, maps, edges, by_image)
+        direct = gradient.direct(frame, surface, maps, pixel_loss)
+        if direct is not None:
+            terms.append(direct)
+        if dr.grad_enabled(posed) and level in self.laplacians:
+            terms.append(self.laplacians[level].per_vertex(posed) * laplacian_weight)
+        gradient.backward(terms)
+        value = dr.detach(direct) if want_loss and direct is not None else None
+        return value, model.gradients(shape, layer, stored)
 
 
 def step(
-    model: Model,
+    gradients: Gradients,
     moments: dict[str, adam.Moments],
-    grid: Grid,
-    quality: Quality,
-    loss: Loss,
-    laplacian: Laplacian | None,
     inputs: StepInputs,
     check: Callable[[dict[str, mi.Float]], str | None],
 ) -> StepResult:
     """Advance every parameter once. Nothing moves when ``check`` names a bad gradient."""
-    value, grads = gradients(model, grid, quality, loss, laplacian, inputs)
+    model = gradients.model
+    value, grads = gradients(inputs)
     bad = check(grads)
     if bad is None:
         for name, parameter in model.parameters.items():
             parameter.value, moments[name] = adam.update(parameter, grads[name], moments[name], inputs.rate)
         model.update_scene()
-    return StepResult(float(value[0]) if inputs.want_loss else None, bad)
+    return StepResult(None if value is None else float(value[0]), bad)
 
 
 def first_non_finite(grads: dict[str, mi.Float]) -> str | None:

@@ -43,7 +43,7 @@ class TexelCodec:
         self.size = size
         self.packed = 1 << (len(channels) - 1).bit_length()
         self.layout = pyramid_layout([(size, size)], self.packed, [CLAMP], MAX_LEVELS)
-        self._template = Pyramid(self.layout, mi.Float(0))
+        self._template = Pyramid.of(self.layout, mi.Float(0))
         self._is_color = [c in COLORS for c in channels] + [False] * (self.packed - len(channels))
 
     def encode(self, maps: Mapping[str, NDArray]) -> mi.Float:
@@ -62,6 +62,14 @@ class TexelCodec:
 
     def layer(self, stored: mi.Float) -> TexelLayer:
         """Pyramid of the stored values, ready for the renderer. Not differentiated: see ``pull_back``."""
+        return self.layer_of(self.texels(stored))
+
+    def layer_of(self, texels: mi.Float) -> TexelLayer:
+        """The layer around the ``texels`` of its pyramid."""
+        return TexelLayer(self.channels, self._template.with_texels(texels))
+
+    def texels(self, stored: mi.Float) -> mi.Float:
+        """All levels of the pyramid of the stored values."""
         with dr.suspend_grad():
             level = self.decode(stored)
             levels = [level]
@@ -70,7 +78,7 @@ class TexelCodec:
                 levels.append(level)
             texels = levels[0] if len(levels) == 1 else dr.concat(levels)
             dr.eval(texels)
-        return TexelLayer(self.channels, self._template.with_texels(texels))
+        return texels
 
     def pull_back(self, gradient: mi.Float, stored: mi.Float) -> mi.Float:
         """Gradient for the stored values from the gradient of all levels of the pyramid: each level

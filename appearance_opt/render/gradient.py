@@ -23,6 +23,7 @@ import mitsuba as mi
 
 from appearance_opt.render import coverage, rays, silhouette
 from appearance_opt.render.deferred import Grid, pixel_index, shade
+from appearance_opt.render.freezing import traced
 from appearance_opt.render.material import MaterialMaps
 from appearance_opt.render.rays import MISS, Samples
 from appearance_opt.render.silhouette import EdgeList, EdgeSamples
@@ -30,6 +31,8 @@ from appearance_opt.render.surface import Surface
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+
+    from appearance_opt.render.freezing import Run
 
 
 @dataclass(frozen=True)
@@ -51,8 +54,9 @@ class Frame:
 
     ``image``: (pixels * 4) premultiplied linear radiance and coverage, without the deferred pixels.
     ``averaged``: the covered camera rays that are averaged in it; ``deferred``: those that are not in the image
-    yet, each the only one of its pixel; None without any. ``edges``: visible silhouette points, None without
-    any; ``contrast``: c_in - c_out at them, premultiplied RGB and coverage.
+    yet, each the only one of its pixel; None without any. ``crossed``: indices of the pixels that a silhouette
+    crosses; ``edges``: its visible points, None without any; ``contrast``: c_in - c_out at them, premultiplied RGB
+    and coverage.
     """
 
     grid: Grid
@@ -60,6 +64,7 @@ class Frame:
     image: mi.Float
     averaged: Weighted | None
     deferred: Weighted | None
+    crossed: mi.UInt32 | None
     edges: EdgeSamples | None
     contrast: mi.ArrayXf | None
 
@@ -93,29 +98,48 @@ def render(
     quality: Quality,
     seed: int,
     defer: bool = False,
+    run: Run = traced,
 ) -> Frame:
     """Forward pass, without gradients (``surface`` and ``maps`` are read detached). With ``defer``, pixels of
-    a single sample are not shaded but left to ``direct``."""
+    a single sample are not shaded but left to ``direct``. ``run``: how its stages are called (see ``freezing``)."""
     with dr.suspend_grad():
         edges = None
         if edge_list is not None and quality.edge_density > 0:
             edges = silhouette.sample_edges(
-                scene, edge_list, surface.vertices, records, grid, quality.edge_density, seed
+                scene, edge_list, surface.vertices, records, grid, quality.edge_density, seed, run
             )
-        averaged, deferred = _camera_samples(scene, records, grid, edges, quality, defer)
-        image = dr.zeros(mi.Float, grid.pixels * 4)
-        if averaged is not None:
-            w = averaged.weight
-            c = shade(surface, maps, records, averaged.samples, grid.size, averaged.width)
-            value = mi.ArrayXf([c.x * w, c.y * w, c.z * w, w])
-            dr.scatter_reduce(dr.ReduceOp.Add, image, value, averaged.pixel, mode=dr.ReduceMode.Local)
-        contrast = None if edges is None else _contrast(surface, maps, records, edges, grid.size)
-        if edges is not None and contrast is not None:
-            dr.eval(image, contrast)
-            missed = coverage.correction(edges, contrast, grid.pixels, quality.edge_samples, grid.rows)
-            image = coverage.corrected(image, missed)
+        averaged, deferred, crossed = _camera_samples(scene, records, grid, edges, quality, defer, run)
+        image, contrast = run(
+            _averages, surface, maps, records, grid.size, grid.rows, grid.pixels, averaged, edges, quality.edge_samples
+        )
         dr.eval(image, contrast)
-    return Frame(grid, records, image, averaged, deferred, edges, contrast)
+    return Frame(grid, records, image, averaged, deferred, crossed, edges, contrast)
+
+
+def _averages(
+    surface: Surface,
+    maps: MaterialMaps,
+    records: mi.Float,
+    size: mi.Float,
+    rows: mi.UInt32,
+    pixels: int,
+    averaged: Weighted | None,
+    edges: EdgeSamples | None,
+    edge_samples: int,
+) -> tuple[mi.Float, mi.ArrayXf | None]:
+    """(image without the deferred pixels, contrast at the silhouette points)."""
+    image = dr.zeros(mi.Float, pixels * 4)
+    if averaged is not None:
+        w = averaged.weight
+        c = shade(surface, maps, records, averaged.samples, size, averaged.width)
+        value = mi.ArrayXf([c.x * w, c.y * w, c.z * w, w])
+        dr.scatter_reduce(dr.ReduceOp.Add, image, value, averaged.pixel, mode=dr.ReduceMode.Local)
+    if edges is None:
+        return image, None
+    contrast = _contrast(surface, maps, records, edges, size)
+    dr.eval(image, contrast)
+    missed = coverage.correction(edges, contrast, pixels, edge_samples, rows)
+    return coverage.corrected(image, missed), contrast
 
 
 def direct(
@@ -163,34 +187,54 @@ def backward(terms: list[mi.Float]) -> None:
 
 
 def _camera_samples(
-    scene: mi.Scene, records: mi.Float, grid: Grid, edges: EdgeSamples | None, quality: Quality, defer: bool
-) -> tuple[Weighted | None, Weighted | None]:
+    scene: mi.Scene, records: mi.Float, grid: Grid, edges: EdgeSamples | None, quality: Quality, defer: bool, run: Run
+) -> tuple[Weighted | None, Weighted | None, mi.UInt32 | None]:
     """Covered camera rays, (averaged, deferred): ``samples`` in each pixel, ``edge_samples`` where a silhouette
-    passes."""
-    crossed = dr.zeros(mi.Bool, grid.pixels)
+    passes; and the pixels where one does."""
+    on_edge = dr.zeros(mi.Bool, grid.pixels)
     if edges is not None:
-        dr.scatter(crossed, mi.Bool(True), edges.pixel)
+        dr.scatter(on_edge, mi.Bool(True), edges.pixel)
+    dr.eval(on_edge)
     pixel = (grid.view * grid.rows + grid.row) * grid.rows + grid.column
-    on_edge = dr.gather(mi.Bool, crossed, pixel)
     parts, weights = [], []
     for dx, dy in rays.sub_pixel_offsets(quality.samples):
-        x, y = mi.Float(grid.column) + dr.opaque(mi.Float, dx), mi.Float(grid.row) + dr.opaque(mi.Float, dy)
-        hits = rays.trace(scene, records, grid.view, x, y, grid.size)
-        dr.eval(hits, on_edge)
-        parts.append(rays.keep(hits, dr.compress((hits.triangle != MISS) & ~on_edge)))
+        offset = dr.opaque(mi.Float, dx), dr.opaque(mi.Float, dy)
+        hits, inside = run(
+            _hits, scene, records, grid.view, grid.column, grid.row, grid.size, grid.rows, *offset, on_edge
+        )
+        parts.append(rays.keep(hits, dr.compress(inside)))
         weights.append(1 / quality.samples)
     deferred = None
     if defer and quality.samples == 1:
         deferred = _weighted(parts, None, grid, quality.point_width)
         parts, weights = [], []
+    crossed = None
     if edges is not None:
+        place = dr.compress(dr.gather(mi.Bool, on_edge, pixel))
+        crossed = dr.gather(mi.UInt32, pixel, place)
         parts.append(
-            rays.trace_pixels(
-                scene, records, grid.view, grid.column, grid.row, dr.compress(on_edge), quality.edge_samples, grid.size
-            )
+            rays.trace_pixels(scene, records, grid.view, grid.column, grid.row, place, quality.edge_samples, grid.size)
         )
         weights.append(1 / quality.edge_samples)
-    return _weighted(parts, weights, grid, quality.sample_width), deferred
+    return _weighted(parts, weights, grid, quality.sample_width), deferred, crossed
+
+
+def _hits(
+    scene: mi.Scene,
+    records: mi.Float,
+    view: mi.UInt32,
+    column: mi.UInt32,
+    row: mi.UInt32,
+    size: mi.Float,
+    rows: mi.UInt32,
+    dx: mi.Float,
+    dy: mi.Float,
+    on_edge: mi.Bool,
+) -> tuple[Samples, mi.Bool]:
+    """What the ray at the offset (dx, dy) in every pixel hits, and whether it hits, away from silhouettes."""
+    hits = rays.trace(scene, records, view, mi.Float(column) + dx, mi.Float(row) + dy, size)
+    pixel = (view * rows + row) * rows + column
+    return hits, (hits.triangle != MISS) & ~dr.gather(mi.Bool, on_edge, pixel)
 
 
 def _weighted(parts: list[Samples], weights: list[float] | None, grid: Grid, width_of_one: float) -> Weighted | None:
@@ -231,17 +275,14 @@ def _contrast(
     surface: Surface, maps: MaterialMaps, records: mi.Float, edges: EdgeSamples, size: mi.Float
 ) -> mi.ArrayXf:
     """c_in - c_out at the silhouette points: premultiplied RGB and coverage."""
-    both = _concat([edges.inside, edges.outside])
-    covered = both.triangle != MISS
-    both = Samples(both.view, both.x, both.y, dr.select(covered, both.triangle, 0))
-    color = shade(surface, maps, records, both, size, dr.opaque(mi.Float, 1.0)) & covered
-    alpha = dr.select(covered, mi.Float(1), 0)
-    dr.eval(color, alpha)
-    n = dr.width(edges.edge)
-    inner, outer = dr.arange(mi.UInt32, n), dr.arange(mi.UInt32, n) + dr.opaque(mi.UInt32, n)
-    return mi.ArrayXf(
-        [dr.gather(mi.Float, c, inner) - dr.gather(mi.Float, c, outer) for c in (color.x, color.y, color.z, alpha)]
-    )
+
+    def seen(side: Samples) -> mi.ArrayXf:
+        covered = side.triangle != MISS
+        hits = Samples(side.view, side.x, side.y, dr.select(covered, side.triangle, 0))
+        color = shade(surface, maps, records, hits, size, mi.Float(1)) & covered
+        return mi.ArrayXf([color.x, color.y, color.z, dr.select(covered, mi.Float(1), 0)])
+
+    return seen(edges.inside) - seen(edges.outside)
 
 
 def _pixel(image: mi.Float, index: mi.UInt32) -> mi.ArrayXf:

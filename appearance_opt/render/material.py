@@ -6,6 +6,7 @@ of the job: it has no texture, no gradient and no lookup.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
@@ -15,11 +16,11 @@ import mitsuba as mi
 from appearance_opt.render.brdf import MaterialSample
 from appearance_opt.render.math import at_least, unit
 
-if TYPE_CHECKING:
-    from collections.abc import Mapping
+# not only for the type checker: Dr.Jit resolves the annotations of data classes when it looks for arrays
+from appearance_opt.render.texture import Pyramid
 
+if TYPE_CHECKING:
     from appearance_opt.render.surface import Hit
-    from appearance_opt.render.texture import Pyramid
 
 CHANNELS = ("red", "green", "blue", "roughness", "metalness", "normal_x", "normal_y", "normal_z", "gamma")
 """Every channel a material can have. Colours are linear, normals in [-1, 1]; without ``normal_z`` it

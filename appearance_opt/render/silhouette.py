@@ -22,12 +22,14 @@ import mitsuba as mi
 import numpy as np
 
 from appearance_opt.render import rays
+from appearance_opt.render.freezing import traced
 from appearance_opt.render.rays import Samples
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from appearance_opt.render.deferred import Grid
+    from appearance_opt.render.freezing import Run
 
 OFFSET = 1e-3
 """Distance in pixels of the two rays from the edge."""
@@ -69,6 +71,24 @@ class EdgeSamples:
     inside: Samples
     outside: Samples
 
+    def keep(self, index: mi.UInt32) -> EdgeSamples:
+        """The points at the given places of the list."""
+
+        def pick(v: mi.Float | mi.UInt32) -> mi.Float | mi.UInt32:
+            return dr.gather(type(v), v, index)
+
+        return EdgeSamples(
+            pick(self.edge),
+            pick(self.view),
+            pick(self.position),
+            pick(self.pixel),
+            self.length,
+            pick(self.normal_x),
+            pick(self.normal_y),
+            rays.keep(self.inside, index),
+            rays.keep(self.outside, index),
+        )
+
 
 def edge_list(faces: NDArray) -> EdgeList:
     """All edges of a welded mesh (F, 3)."""
@@ -96,10 +116,19 @@ def project(camera: rays.Camera, p: mi.Point3f, resolution: mi.Float) -> tuple[m
 
 
 def silhouette_edges(
-    edges: EdgeList, vertices: mi.Float, records: mi.Float, views: int, resolution: mi.Float
+    edges: EdgeList, vertices: mi.Float, records: mi.Float, views: int, resolution: mi.Float, run: Run = traced
 ) -> tuple[mi.UInt32, mi.Float]:
     """(index, length): the silhouettes among all pairs (view * edges + edge), and their projected
     lengths in pixels. ``vertices``: packets of ``Surface.vertices``."""
+    visible, length = run(_candidates, edges, vertices, records, views, resolution)
+    index = dr.compress(visible)
+    return index, dr.gather(mi.Float, length, index)
+
+
+def _candidates(
+    edges: EdgeList, vertices: mi.Float, records: mi.Float, views: int, resolution: mi.Float
+) -> tuple[mi.Bool, mi.Float]:
+    """(silhouette and in view, projected length) of all pairs (view * edges + edge)."""
     i = dr.arange(mi.UInt32, views * edges.count)
     view = i // edges.count
     edge = dr.gather(mi.ArrayXu, edges.packets, i - view * edges.count, shape=(4, views * edges.count))
@@ -115,8 +144,7 @@ def silhouette_edges(
     # an edge that leaves the image by far would take all the samples: it is dropped, as are those
     # that come too close to the camera to be projected
     visible = silhouette & (az > near) & (bz > near) & (length > 0) & (length < 4 * resolution)
-    index = dr.compress(visible)
-    return index, dr.gather(mi.Float, length, index)
+    return visible, length
 
 
 def sample_edges(
@@ -127,74 +155,69 @@ def sample_edges(
     grid: Grid,
     density: float,
     seed: int,
+    run: Run = traced,
 ) -> EdgeSamples | None:
     """Visible silhouette points, about ``density`` per pixel of projected length; None if there are
     none. Stratified along the total length; ``seed`` moves the points within their strata."""
-    size = grid.size
-    index, length = silhouette_edges(edges, vertices, records, grid.views, size)
+    index, length = silhouette_edges(edges, vertices, records, grid.views, grid.size, run)
     if dr.width(index) == 0:
         return None
     upper = dr.cumsum(length)
     total = float(upper[dr.width(upper) - 1])
     count = min(max(int(total * density), 1), MAX_SAMPLES)
-    points = _points(edges, vertices, records, size, grid.views, index, upper, dr.opaque(mi.Float, total), count, seed)
-    x, y, depth = points[4], points[5], points[6]
-    nx, ny = points[2], points[3]
-    view = points[1]
-    hits = []
-    visible = (x > 0) & (y > 0) & (x < size) & (y < size)
-    for sign in (-OFFSET, OFFSET):
-        hit, hit_depth = rays.trace_depth(scene, records, view, dr.fma(nx, sign, x), dr.fma(ny, sign, y), size)
-        visible &= hit_depth > depth * (1 - DEPTH_SLACK)
-        hits.append(hit)
-    # an edge with the same face (or nothing) on both sides has no contrast
-    visible &= hits[0].triangle != hits[1].triangle
-    kept = dr.compress(visible)
-    if dr.width(kept) == 0:
-        return None
-    pixel = (view * grid.rows + mi.UInt32(y)) * grid.rows + mi.UInt32(x)
-
-    def pick(v: mi.Float | mi.UInt32) -> mi.Float | mi.UInt32:
-        return dr.gather(type(v), v, kept)
-
-    share = dr.opaque(mi.Float, total / count)
-    return EdgeSamples(
-        edge=pick(points[0]),
-        view=pick(view),
-        position=pick(points[7]),
-        pixel=pick(pixel),
-        length=share,
-        normal_x=pick(nx),
-        normal_y=pick(ny),
-        inside=rays.keep(hits[0], kept),
-        outside=rays.keep(hits[1], kept),
+    number = dr.arange(mi.UInt32, count)
+    dr.eval(number)
+    strata = Strata(index, upper, dr.opaque(mi.UInt32, dr.width(upper) - 1), dr.opaque(mi.Float, total / count))
+    points, visible = run(
+        _points,
+        scene,
+        edges,
+        vertices,
+        records,
+        grid.size,
+        grid.rows,
+        grid.views,
+        strata,
+        number,
+        dr.opaque(mi.UInt32, seed),
     )
+    kept = dr.compress(visible)
+    return points.keep(kept) if dr.width(kept) else None
+
+
+@dataclass
+class Strata:
+    """Silhouettes in a row: ``index`` of each (view * edges + edge), the length ``upper`` up to its end, the number of
+    the ``last``, and the ``spacing`` of points along them."""
+
+    index: mi.UInt32
+    upper: mi.Float
+    last: mi.UInt32
+    spacing: mi.Float
 
 
 def _points(
+    scene: mi.Scene,
     edges: EdgeList,
     vertices: mi.Float,
     records: mi.Float,
     resolution: mi.Float,
+    rows: mi.UInt32,
     views: int,
-    index: mi.UInt32,
-    upper: mi.Float,
-    total: mi.Float,
-    count: int,
-    seed: int,
-) -> tuple:
-    """Points along the silhouettes: (edge, view, outward normal x, y, pixel x, y, depth, parameter)."""
-    k = dr.arange(mi.UInt32, count)
-    jitter = mi.sample_tea_float32(k, dr.opaque(mi.UInt32, seed))
-    at = (mi.Float(k) + jitter) * (total / dr.opaque(mi.Float, count))
-    found = _first_not_below(upper, at, views * edges.count)
-    pair = dr.gather(mi.UInt32, index, found)
-    begin = dr.gather(mi.Float, upper, found - 1, found > 0)
-    s = (at - begin) / (dr.gather(mi.Float, upper, found) - begin)
+    strata: Strata,
+    number: mi.UInt32,
+    seed: mi.UInt32,
+) -> tuple[EdgeSamples, mi.Bool]:
+    """The points of the given numbers along the silhouettes, and whether each is visible."""
+    at = (mi.Float(number) + mi.sample_tea_float32(number, seed)) * strata.spacing
+    found = _first_not_below(strata.upper, at, strata.last, views * edges.count)
+    pair = dr.gather(mi.UInt32, strata.index, found)
+    begin = dr.gather(mi.Float, strata.upper, found - 1, found > 0)
+    s = (at - begin) / (dr.gather(mi.Float, strata.upper, found) - begin)
     s = dr.select((s > 0) & (s < 1), s, 0.5)
     view = pair // edges.count
     edge = pair - view * edges.count
-    ends = dr.gather(mi.ArrayXu, edges.packets, edge, shape=(4, count))
+    ends = dr.gather(mi.ArrayXu, edges.packets, edge, shape=(4, dr.width(edge)))
     camera = rays.camera_of(records, view)
     ax, ay, az = project(camera, _position(vertices, ends[0]), resolution)
     bx, by, bz = project(camera, _position(vertices, ends[1]), resolution)
@@ -203,15 +226,24 @@ def _points(
     scale = dr.rsqrt(dr.fma(nx, nx, ny * ny))
     # outward: away from the face's third vertex; one behind the camera is projected to the other side
     scale = dr.select((nx * (ox - ax) + ny * (oy - ay) > 0) == (oz > 0), -scale, scale)
+    nx, ny = nx * scale, ny * scale
     x, y = dr.lerp(ax, bx, s), dr.lerp(ay, by, s)
     depth = dr.rcp(dr.lerp(dr.rcp(az), dr.rcp(bz), s))
-    return edge, view, nx * scale, ny * scale, x, y, depth, s
+    hits = []
+    visible = (x > 0) & (y > 0) & (x < resolution) & (y < resolution)
+    for sign in (-OFFSET, OFFSET):
+        hit, hit_depth = rays.trace_depth(scene, records, view, dr.fma(nx, sign, x), dr.fma(ny, sign, y), resolution)
+        visible &= hit_depth > depth * (1 - DEPTH_SLACK)
+        hits.append(hit)
+    # an edge with the same face (or nothing) on both sides has no contrast
+    visible &= hits[0].triangle != hits[1].triangle
+    pixel = (view * rows + mi.UInt32(y)) * rows + mi.UInt32(x)
+    return EdgeSamples(edge, view, s, pixel, strata.spacing, nx, ny, hits[0], hits[1]), visible
 
 
-def _first_not_below(ascending: mi.Float, value: mi.Float, longest: int) -> mi.UInt32:
-    """Index of the first entry >= value (the last entry if there is none). The number of bisections
+def _first_not_below(ascending: mi.Float, value: mi.Float, last: mi.UInt32, longest: int) -> mi.UInt32:
+    """Index of the first entry >= value (the ``last`` entry if there is none). The number of bisections
     follows from the ``longest`` possible array, so that one kernel serves all lengths."""
-    last = dr.opaque(mi.UInt32, dr.width(ascending) - 1)
     found = dr.zeros(mi.UInt32, dr.width(value))
     for bit in reversed(range(longest.bit_length())):
         candidate = found + (1 << bit)

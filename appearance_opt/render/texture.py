@@ -7,7 +7,7 @@ buffer; a small table says where each level starts and how large it is.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import drjit as dr
@@ -73,23 +73,27 @@ def pyramid_layout(
     return PyramidLayout(channels, tuple(padded), tuple(offsets), tuple(wraps), start)
 
 
+@dataclass(frozen=True)
 class Pyramid:
-    """Texels on the device, with their layout. ``texels`` may carry gradients; the rest never does."""
+    """Texels on the device, with their layout. ``texels`` may carry gradients; the rest never does. ``table``
+    (4 per material and level): offset, width, height, wrap mode."""
 
-    def __init__(self, layout: PyramidLayout, texels: mi.Float) -> None:
-        self.layout = layout
-        self.texels = texels
+    layout: PyramidLayout
+    texels: mi.Float
+    table: mi.UInt32
+
+    @classmethod
+    def of(cls, layout: PyramidLayout, texels: mi.Float) -> Pyramid:
+        """A pyramid with the table of its layout."""
         table = np.zeros((len(layout.sizes), layout.levels, 4), np.uint32)
         for m, (sizes, offsets, wrap) in enumerate(zip(layout.sizes, layout.offsets, layout.wraps, strict=True)):
             for k, ((w, h), offset) in enumerate(zip(sizes, offsets, strict=True)):
                 table[m, k] = offset, w, h, wrap
-        self.table = mi.UInt32(table.ravel())
+        return cls(layout, texels, mi.UInt32(table.ravel()))
 
     def with_texels(self, texels: mi.Float) -> Pyramid:
         """The same layout around other texels (no copy of the table)."""
-        other = object.__new__(Pyramid)
-        other.layout, other.table, other.texels = self.layout, self.table, texels
-        return other
+        return replace(self, texels=texels)
 
     def lookup(self, material: mi.UInt32 | None, uv: mi.Point2f, footprint: mi.Float) -> list:
         """Trilinear lookup.
@@ -204,4 +208,4 @@ def build_pyramid(bases: Sequence[NDArray[np.float32]], wraps: Sequence[int], ma
             parts.append(level)
     texels = parts[0] if len(parts) == 1 else dr.concat(parts)
     dr.eval(texels)
-    return Pyramid(layout, texels)
+    return Pyramid.of(layout, texels)

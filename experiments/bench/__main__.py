@@ -72,7 +72,7 @@ def run_case(resolution: int, latent: int, reference: int, maps: int, live: bool
     from appearance_opt.fit.laplacian import Laplacian
     from appearance_opt.fit.loop import LOSS_EVERY
     from appearance_opt.fit.losses import LOSSES
-    from appearance_opt.fit.step import StepInputs, first_non_finite, step
+    from appearance_opt.fit.step import Gradients, StepInputs, first_non_finite, step
     from appearance_opt.reference.pool import Targets
     from appearance_opt.render.deferred import Grid
     from appearance_opt.render.gradient import Quality
@@ -82,6 +82,7 @@ def run_case(resolution: int, latent: int, reference: int, maps: int, live: bool
     mesh = model.topology.mesh
     laplacian = Laplacian(mesh.positions, mesh.faces, model.edge_length, relative=True)
     moments = {n: adam.moments_of(p) for n, p in model.parameters.items()}
+    gradients = Gradients(model, grid, Quality(1.0, 4, 1), LOSSES["log-srgb-l1"], {0: laplacian})
     views = [sampler.draw(k, 4) for k in range(8)]
     images = [source.render_device(v.records(), grid, 1) for v in views]
 
@@ -91,7 +92,7 @@ def run_case(resolution: int, latent: int, reference: int, maps: int, live: bool
             image = source.render_device(v.records(), grid, 1)
         background = np.full((4, 3), 0.3, np.float32)
         inputs = StepInputs(v, Targets(image), background, 0.01, 1.0, k, want_loss=k % LOSS_EVERY == 0)
-        step(model, moments, grid, Quality(1.0, 4, 1), LOSSES["log-srgb-l1"], laplacian, inputs, first_non_finite)
+        step(gradients, moments, inputs, first_non_finite)
 
     for k in range(10):
         one(k)

@@ -15,13 +15,14 @@ import mitsuba as mi
 import numpy as np
 
 from appearance_opt import backend
-from appearance_opt.backend import to_device
 from appearance_opt.fit import adam
-from appearance_opt.fit.losses import LOSSES, covered_loss, image_loss
-from appearance_opt.fit.model import POSITIONS, TEXELS
+from appearance_opt.fit.losses import LOSSES, Target, compared_pixels, covered_loss, image_loss
+from appearance_opt.fit.model import POSITIONS, TEXELS, Shape
 from appearance_opt.render import gradient
 from appearance_opt.render.deferred import Grid
+from appearance_opt.render.freezing import Frozen
 from appearance_opt.render.gradient import Quality
+from appearance_opt.render.material import TexelLayer
 from experiments.bench.__main__ import set_up
 
 REPEATS = 15
@@ -78,36 +79,34 @@ def stages(resolution: int, maps: int) -> dict[str, float]:
     dr.enable_grad(positions)
     timed("normals and tangent frames", lambda: model.surface(positions).vertices)
     surface, layer = model.surface(positions), model.fitted_layer()
-    dr.enable_grad(layer.pyramid.texels)
     scene, all_maps = model.scene, model.maps(layer)
-    background = to_device(np.full((4, 4), 0.3))
-    loss, per_view = LOSSES["log-srgb-l1"], dr.opaque(mi.UInt32, resolution**2)
+    loss, target = LOSSES["log-srgb-l1"], Target.of(reference, np.full((4, 3), 0.3))
+    run = Frozen(model.fixed(), grid)
 
     def forward(quality: Quality) -> gradient.Frame:
-        return gradient.render(scene, surface, all_maps, edges, records, grid, quality, 0, defer=True)
+        return gradient.render(scene, surface, all_maps, edges, records, grid, quality, 0, True, run)
 
     timed("visibility alone", lambda: forward(Quality(0.0, 1, 1)).image)
     timed("visibility, silhouettes, averaged pixels", lambda: forward(quality).image)
     frame = forward(quality)
 
     def averaged() -> tuple:
-        return image_loss(loss, frame.image, reference, background, per_view, frame.complete())
+        pixels = compared_pixels(frame.image, target, frame.complete())
+        return run(image_loss, loss, target, frame.image, pixels, grid.pixels)
 
     timed("loss of averaged pixels", averaged)
     _, by_image = averaged()
 
     def backward() -> tuple:
-        p = mi.Float(model.positions())
-        dr.enable_grad(p)
-        texels = mi.Float(dr.detach(layer.pyramid.texels))
-        dr.enable_grad(texels)
-        fresh, moving = model.maps(layer.with_texels(texels)), model.surface(p)
+        return run(pulled_back, frame, model.shape(), layer, by_image)
+
+    def pulled_back(frame: gradient.Frame, shape: Shape, layer: TexelLayer, by_image: mi.Float) -> tuple:
+        shape, layer = model.track(shape, layer)
+        fresh, moving = model.maps(layer), model.surface(shape.positions)
         terms = gradient.surrogate(frame, moving, fresh, edges, by_image)
-        direct = gradient.direct(
-            frame, moving, fresh, lambda c, pixel: covered_loss(loss, c, pixel, reference, background, per_view)
-        )
+        direct = gradient.direct(frame, moving, fresh, lambda c, pixel: covered_loss(loss, target, c, pixel))
         gradient.backward([*terms, direct])
-        return dr.grad(p), dr.grad(texels)
+        return dr.grad(shape.positions), dr.grad(layer.pyramid.texels)
 
     grads = timed("shading, loss and gradients of all other pixels", backward)
     parameter = model.parameters[TEXELS]

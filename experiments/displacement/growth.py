@@ -30,7 +30,7 @@ def measure(triangles: int, level: int) -> str:
     from appearance_opt.fit.loop import laplacians
     from appearance_opt.fit.losses import LOSSES
     from appearance_opt.fit.model import Model, Rates
-    from appearance_opt.fit.step import StepInputs, gradients
+    from appearance_opt.fit.step import Gradients, StepInputs
     from appearance_opt.initial.sphere import sphere
     from appearance_opt.reference.pool import Targets
     from appearance_opt.render.deferred import Grid
@@ -42,14 +42,15 @@ def measure(triangles: int, level: int) -> str:
     maps |= {"normal_x": flat, "normal_y": flat, "normal_z": flat + 1, "displacement": flat}
     parts = frozenset({"shape", "material", "normal", "displacement"})
     model = Model(sphere(triangles, (0.0, 0.0, 0.0), 1.0, SIZE), maps, parts, Rates(), (level,))
-    laplacian, grid = laplacians(model, True)[level], Grid(4, 256)
+    grid = Grid(4, 256)
+    gradients = Gradients(model, grid, Quality(), LOSSES["log-srgb-l1"], laplacians(model, True))
     views = ViewSampler((0.0, 0.0, 0.0), 1.0, seed=1).draw(0, 4)
     reference = Targets(mi.Float(np.full(grid.pixels * 4, 0.3, np.float32)))
     inputs = StepInputs(views, reference, np.zeros((4, 3), np.float32), 1.0, 1.0, 3)
     times = []
     for _ in range(6):
         began = time.process_time()
-        dr.eval(gradients(model, grid, Quality(), LOSSES["log-srgb-l1"], laplacian, inputs))
+        dr.eval(gradients(inputs))
         model.update_scene()
         dr.sync_thread()
         times.append(time.process_time() - began)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from appearance_opt.fit.losses import LOSSES
 from appearance_opt.fit.model import POSITIONS, Model, Rates
-from appearance_opt.fit.step import StepInputs, gradients
+from appearance_opt.fit.step import Gradients, StepInputs
 from appearance_opt.reference.pool import Targets
 from appearance_opt.render.deferred import Grid
 from appearance_opt.render.gradient import Quality
@@ -28,6 +28,9 @@ class ColoredModel(Model):
         super().__init__(problem.mesh, constants, frozenset(("shape",)), Rates())
         self.colors = problem.surface(self.topology, self.positions(), problem.colors).colors
 
+    def fixed(self) -> tuple:
+        return (*super().fixed(), self.colors)
+
     def surface(self, positions: mi.Float) -> Surface:
         return replace(super().surface(positions), frames=None, corners=None, colors=self.colors)
 
@@ -43,6 +46,7 @@ class Ours:
         rgba[:, :3] = target
         reference = Targets(mi.Float(rgba.ravel()))
         self.inputs = StepInputs(problem.views, reference, np.array([BACKGROUND], np.float32), 0.0, 0.0, 0)
+        self._gradients: dict[Quality, Gradients] = {}
 
     def __call__(self, quality: Quality, seed: int) -> NDArray[np.float32]:
         """dLoss/dPositions (V, 3)."""
@@ -54,5 +58,7 @@ class Ours:
         self.model.parameters[POSITIONS].value = self.model.positions() + dr.opaque(mi.Float, 0.0)
         self.model.update_scene()
         inputs = replace(self.inputs, seed=seed)
-        _, grads = gradients(self.model, self.grid, quality, self.loss, None, inputs)
+        if quality not in self._gradients:
+            self._gradients[quality] = Gradients(self.model, self.grid, quality, self.loss)
+        _, grads = self._gradients[quality](inputs)
         return grads[POSITIONS]

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from appearance_opt import backend
 from appearance_opt.fit.losses import LOSSES
 from appearance_opt.fit.model import TEXELS, Model, Rates
-from appearance_opt.fit.step import StepInputs, gradients
+from appearance_opt.fit.step import Gradients, StepInputs
 from appearance_opt.initial.sphere import sphere
 from appearance_opt.latent.texels import TexelCodec
 from appearance_opt.reference.pool import Targets
@@ -107,7 +107,7 @@ def measure(scene: str, size: int, resolution: int) -> list[str]:
             truth[k] = (values[0] - values[1]) / (2 * STEP) / (3 * grid.pixels)
         parameter.value = mi.Float(start)
         for name, quality in SETTINGS.items():
-            _, grads = gradients(model, grid, quality, LOSSES["log-srgb-l1"], None, inputs)
+            _, grads = Gradients(model, grid, quality, LOSSES["log-srgb-l1"], freeze=False)(inputs)
             e = error_of((np.array(grads[TEXELS]).astype(np.float64) @ fields.T)[None], truth)
             lines.append(
                 f"| {scene} | {channel} | {name} | {e.relative:.4f} | {e.cosine:.5f} | {100 * e.bias:+.2f} % |"
