@@ -117,6 +117,7 @@ def trace_pixels(
     x = mi.Float(dr.gather(mi.UInt32, column, at)) + dr.gather(mi.Float, offsets, offset)
     y = mi.Float(dr.gather(mi.UInt32, row, at)) + dr.gather(mi.Float, offsets, offset + 1)
     fine = trace(scene, records, dr.gather(mi.UInt32, view, at), x, y, resolution)
+    dr.eval(fine)  # or the mask and the triangles would each trace them
     return keep(fine, dr.compress(fine.triangle != MISS))
 
 
