@@ -21,8 +21,12 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
+
+if TYPE_CHECKING:
+    from appearance_opt.asset.types import Mesh
 
 ROOT = Path(__file__).resolve().parents[2]
 JUDGE = ROOT.parent / "shared" / "judge"
@@ -100,7 +104,15 @@ def blender(python: str, source: Path, low: Path, stem: Path, reach: float) -> d
 def blender_asset(stem: Path, folder: Path) -> None:
     """Blender's maps on the same mesh with the same frames, as a GLB."""
     from appearance_opt import load, save
-    from appearance_opt.asset.types import Asset, Material, Texture
+    from appearance_opt.asset.types import Asset
+
+    mesh = maps_of_blender(load(f"{stem}_closed.glb").meshes[0], folder)
+    save(Asset((mesh,), "blender"), f"{stem}_blender.glb")
+
+
+def maps_of_blender(mesh: Mesh, folder: Path) -> Mesh:
+    """A mesh with the maps that blender_bake.py has written to ``folder``."""
+    from appearance_opt.asset.types import Material, Texture
 
     maps = {n: np.load(folder / f"{n}.npy") for n in ("normal", "base_color", "roughness", "metalness")}
     byte = {n: np.round(m / 257).astype(np.uint8) for n, m in maps.items()}
@@ -113,15 +125,14 @@ def blender_asset(stem: Path, folder: Path) -> None:
         orm_texture=Texture(orm, "linear", clamp),
         normal_texture=Texture(byte["normal"], "linear", clamp),
     )
-    mesh = load(f"{stem}_closed.glb").meshes[0]
-    save(Asset((replace(mesh, material=material),), "blender"), f"{stem}_blender.glb")
+    return replace(mesh, material=material)
 
 
 def angles(stem: Path, theirs: np.ndarray) -> dict:
     """Degrees between two normal maps over covered texels."""
     from appearance_opt import load
     from appearance_opt.baking.low import prepare
-    from appearance_opt.initial.transfer import texel_coverage
+    from appearance_opt.baking.points import texel_coverage
 
     asset = load(f"{stem}_closed.glb")
     covered = texel_coverage(prepare(asset).mesh, SIZE)
