@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes.util
+import gc
 import glob
 import os
 import platform
@@ -71,6 +72,14 @@ def to_device(array: NDArray) -> mi.Float:
     own = dr.gather(mi.Float, borrowed, dr.arange(mi.UInt32, dr.width(borrowed)))
     dr.eval(own)
     return own
+
+
+def release_memory() -> None:
+    """Hand memory that Dr.Jit keeps for later arrays back to the system."""
+    import drjit as dr
+
+    gc.collect()  # models and their recorded kernels refer to each other
+    dr.flush_malloc_cache()
 
 
 def install_hint() -> str:

@@ -91,12 +91,16 @@ def simplify(
         watch.lap("write")
     if result.error is not None:
         raise result.error
+    sampler, frame = run.sampler, run.frame
+    # the report uploads what it draws: a heavy reference need not be held twice
+    del run
+    backend.release_memory()
 
     def write_report() -> None:
         from appearance_opt.jobs.report import write_simplify_report
 
         assert report is not None
-        write_simplify_report(Path(report), asset, result, run.sampler, run.frame, options)
+        write_simplify_report(Path(report), asset, result, sampler, frame, options)
 
     conclude(result, watch, None if report is None else write_report)
     return result
