@@ -85,6 +85,9 @@ BackgroundOption = Annotated[str | None, typer.Option(help="random, black, white
 LightOption = Annotated[str | None, typer.Option(help="point (random) or headlight.")]
 SeedOption = Annotated[int | None, typer.Option(help="Seed of views and lights.")]
 RefineOption = Annotated[int | None, typer.Option(help="Level to which USD subdivision surfaces are refined.")]
+MissingTexturesOption = Annotated[
+    str | None, typer.Option(help="error or ignore, when the input names a texture that is not there.")
+]
 DeviceOption = Annotated[str | None, typer.Option(help="auto, cpu or cuda.")]
 ReportOption = Annotated[Path | None, typer.Option(help="Folder for the report [OUT's name + .report].")]
 NoReportOption = Annotated[bool, typer.Option("--no-report", help="Write no report.")]
@@ -135,6 +138,7 @@ def simplify(
     write_tessellated: Annotated[bool | None, typer.Option("--write-tessellated", help="Write them, too.")] = None,
     normal_map: Annotated[bool | None, typer.Option(help="Make a normal map at all.")] = None,
     refine: RefineOption = None,
+    missing_textures: MissingTexturesOption = None,
     variant: Annotated[list[str] | None, typer.Option(help="USD variant: set=name (repeatable).")] = None,
     device: DeviceOption = None,
     report: ReportOption = None,
@@ -212,6 +216,7 @@ def bake(
     light: LightOption = None,
     seed: SeedOption = None,
     refine: RefineOption = None,
+    missing_textures: MissingTexturesOption = None,
     variant: Annotated[list[str] | None, typer.Option(help="USD variant of HIGH: set=name (repeatable).")] = None,
     device: DeviceOption = None,
     joint: Annotated[bool | None, typer.Option("--joint", help="Fit LOW's shape and a displacement, too.")] = None,
@@ -280,11 +285,24 @@ def compare(
     resolution: Annotated[int, typer.Option(help="Pixels per side.", min=16)] = 384,
     seed: Annotated[int, typer.Option(help="Seed of views and lights.")] = 0,
     device: Annotated[str, typer.Option(help="auto, cpu or cuda.")] = "auto",
+    missing_textures: MissingTexturesOption = "error",
 ) -> None:
     """Measure how different two assets look: PSNR, FLIP, silhouettes."""
     from appearance_opt.jobs.compare import compare as run
 
-    metrics = run(reference, candidate, views=views, resolution=resolution, seed=seed, device=device, out=out).metrics
+    result = run(
+        reference,
+        candidate,
+        views=views,
+        resolution=resolution,
+        seed=seed,
+        device=device,
+        out=out,
+        missing_textures=missing_textures,  # type: ignore[arg-type]
+    )
+    for note in result.notes:
+        print(f"note: {note}", file=sys.stderr)
+    metrics = result.metrics
     if as_json:
         import json
         from dataclasses import asdict
@@ -303,6 +321,7 @@ def inspect(
     source: Annotated[Path, typer.Argument(metavar="INPUT", help=".glb .gltf .usd* .obj .ply .stl")],
     as_json: Annotated[bool, typer.Option("--json", help="Print as JSON.")] = False,
     refine: Annotated[int, typer.Option(help="Level to which USD subdivision surfaces are refined.")] = 1,
+    missing_textures: MissingTexturesOption = "error",
     variant: Annotated[list[str] | None, typer.Option(help="USD variant: set=name (repeatable).")] = None,
 ) -> None:
     """Say what is in an asset and what is wrong with it."""
@@ -311,7 +330,7 @@ def inspect(
     from appearance_opt.asset import load
     from appearance_opt.asset.validate import validate
 
-    asset = load(source, refine=refine, variants=_variants(variant))
+    asset = load(source, refine=refine, variants=_variants(variant), missing_textures=missing_textures)  # type: ignore[arg-type]
     found = {"meshes": len(asset.meshes), **asdict(validate(asset)), "notes": list(asset.notes)}
     if as_json:
         import json

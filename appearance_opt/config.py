@@ -10,6 +10,8 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
+from appearance_opt.asset.missing import CHOICES as MISSING_TEXTURES
+from appearance_opt.asset.missing import MissingTextures
 from appearance_opt.errors import InputError
 
 FIT_PARTS = ("shape", "normal", "material", "gamma")
@@ -41,9 +43,9 @@ class CommonOptions:
     views of a step. ``steps``, ``budget`` (seconds for the whole job, set-up and report included): when to stop;
     whichever comes first. ``pool``: number of reference views rendered (each is used many times). ``fit``: what
     moves. ``*_rate``: learning rates, positions in units of the local edge length; by default they follow from how
-    good the start is. ``refine``: level for USD subdivision surfaces. ``subdivision``: tessellation levels of a
-    displaced result (none given: 3); ``write_tessellated``: write those meshes, too. Raises InputError for values
-    that make no sense.
+    good the start is. ``refine``: level for USD subdivision surfaces. ``missing_textures``: "error" or "ignore",
+    when an input names a texture that is not there. ``subdivision``: tessellation levels of a displaced result (none
+    given: 3); ``write_tessellated``: write those meshes, too. Raises InputError for values that make no sense.
     """
 
     texture_size: int = 1024
@@ -63,6 +65,7 @@ class CommonOptions:
     light: str = "point"
     seed: int = 0
     refine: int = 1
+    missing_textures: MissingTextures = "error"
     subdivision: tuple[int, ...] = ()
     write_tessellated: bool = False
     device: str = "auto"
@@ -88,6 +91,7 @@ class CommonOptions:
         _choice("loss", self.loss, LOSS_NAMES)
         _choice("light", self.light, LIGHTS)
         _choice("device", self.device, DEVICES)
+        _choice("missing-textures", self.missing_textures, MISSING_TEXTURES)
         self.background_color()
 
     _needs = "given with a displacement"

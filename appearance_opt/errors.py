@@ -9,6 +9,10 @@ class InputError(AppearanceError):
     """A file or an option is unusable: the message says what, where, and how to mend it."""
 
 
+class MissingFileError(InputError):
+    """A file that an asset refers to is not there."""
+
+
 class BackendError(AppearanceError):
     """Dr.Jit cannot run here: the message says what to install."""
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from appearance_opt.asset.missing import CHOICES, MissingTextures
 from appearance_opt.asset.types import Asset, Displacement, Material, Mesh, Texture
 from appearance_opt.errors import InputError
 
@@ -13,14 +14,24 @@ READABLE = (".glb", ".gltf", ".usd", ".usda", ".usdc", ".usdz", ".obj", ".ply", 
 WRITABLE = (".glb", ".gltf", ".usd", ".usda", ".usdc", ".usdz", ".obj")
 
 
-def load(path: str | Path, *, refine: int = 1, variants: dict[str, str] | None = None) -> Asset:
+def load(
+    path: str | Path,
+    *,
+    refine: int = 1,
+    variants: dict[str, str] | None = None,
+    missing_textures: MissingTextures = "error",
+) -> Asset:
     """Read an asset; the suffix chooses the format. Units become metres, the up axis +Y.
 
     ``refine``: level to which USD subdivision surfaces are refined. ``variants``: USD variant
-    selections by set name, instead of those in the file. Harmless faults are repaired
-    and noted in ``Asset.notes``. Raises InputError for everything else, naming the file.
+    selections by set name, instead of those in the file. ``missing_textures``: "error" refuses an asset that names
+    a texture file which is not there, "ignore" goes on with the material's constants (without a normal map, if it is
+    that) and a note. Harmless faults are repaired and noted in ``Asset.notes``. Raises InputError for everything
+    else, naming the file.
     """
     path = Path(path)
+    if missing_textures not in CHOICES:
+        raise InputError(f"--missing-textures {missing_textures}: choose from {', '.join(CHOICES)}")
     suffix = path.suffix.lower()
     if suffix not in READABLE:
         raise InputError(f"{path}: unknown format '{suffix}'; readable are {' '.join(READABLE)}")
@@ -33,27 +44,29 @@ def load(path: str | Path, *, refine: int = 1, variants: dict[str, str] | None =
     try:
         # numbers that do not fit a float32 become infinite, which ``repair`` refuses by name
         with np.errstate(over="ignore", invalid="ignore"):
-            return repair(_read(path, suffix, refine, variants), str(path))
+            return repair(_read(path, suffix, refine, variants, missing_textures), str(path))
     except MemoryError as error:
         raise InputError(f"{path}: asks for more memory than there is; it is damaged or too large") from error
 
 
-def _read(path: Path, suffix: str, refine: int, variants: dict[str, str] | None) -> Asset:
+def _read(
+    path: Path, suffix: str, refine: int, variants: dict[str, str] | None, missing_textures: MissingTextures
+) -> Asset:
     if suffix in (".glb", ".gltf"):
         from appearance_opt.asset.gltf_read import load_gltf
 
-        return load_gltf(path)
+        return load_gltf(path, missing_textures)
     if suffix == ".obj":
         from appearance_opt.asset.obj import load_obj
 
-        return load_obj(path)
+        return load_obj(path, missing_textures)
     if suffix in (".ply", ".stl"):
         from appearance_opt.asset.geometry import load_geometry
 
         return load_geometry(path)
     from appearance_opt.asset.usd_read import load_usd
 
-    return load_usd(path, refine, variants)
+    return load_usd(path, refine, variants, missing_textures)
 
 
 def save(asset: Asset, path: str | Path) -> None:

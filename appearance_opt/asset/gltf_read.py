@@ -9,6 +9,7 @@ import numpy as np
 
 from appearance_opt.asset import images
 from appearance_opt.asset.gltf_accessors import Document
+from appearance_opt.asset.missing import Missing, MissingTextures
 from appearance_opt.asset.types import Asset, Material, Mesh, Texture, Wrap
 from appearance_opt.errors import InputError
 
@@ -24,21 +25,22 @@ _COMPRESSED = {
 _HARMLESS = {"KHR_mesh_quantization", "KHR_texture_transform", "EXT_texture_webp"}
 
 
-def load_gltf(path: Path) -> Asset:
+def load_gltf(path: Path, missing_textures: MissingTextures = "error") -> Asset:
     """Read a .gltf or .glb file. Raises InputError."""
     document = Document(path)
     try:
-        return _Reader(document).asset()
+        return _Reader(document, missing_textures).asset()
     except (KeyError, IndexError, TypeError, AttributeError, ValueError, OverflowError, RecursionError) as error:
         raise InputError(f"{path}: the glTF structure is broken ({type(error).__name__}: {error})") from error
 
 
 class _Reader:
-    def __init__(self, document: Document) -> None:
+    def __init__(self, document: Document, missing_textures: MissingTextures) -> None:
         self.document = document
         self.path = document.path
         self.notes: list[str] = []
-        self._images: dict[int, NDArray] = {}
+        self.missing = Missing(missing_textures, self.notes)
+        self._images: dict[int, NDArray | None] = {}
         self._materials: dict[int | None, Material] = {}
 
     def asset(self) -> Asset:
@@ -191,10 +193,12 @@ class _Reader:
         if source is None:
             raise InputError(f"{self.path}: a texture of material '{material}' has no image in a supported format")
         if source not in self._images:
-            self._images[source] = self._image(source, material)
+            self._images[source] = self.missing.read(lambda: self._image(source, material))
         sampler = self.document.items("samplers")[texture["sampler"]] if "sampler" in texture else {}
         wrap = (_WRAPS.get(sampler.get("wrapS", 0), "repeat"), _WRAPS.get(sampler.get("wrapT", 0), "repeat"))
         pixels = self._images[source]
+        if pixels is None:
+            return None
         if pixels.shape[2] < 3:  # grey, or grey and alpha
             pixels = np.repeat(pixels[..., :1], 3, axis=2)
         return Texture(pixels, space, wrap)  # type: ignore[arg-type]

@@ -17,8 +17,10 @@ from appearance_opt.errors import InputError
 if TYPE_CHECKING:
     from xml.etree.ElementTree import Element
 
+    from appearance_opt.asset.missing import Missing
 
-def load_materialx(path: Path, name: str) -> Material | None:
+
+def load_materialx(path: Path, name: str, missing: Missing) -> Material | None:
     """The surface material ``name`` of a .mtlx file, or None if it is not there. Raises InputError."""
     try:
         root = ElementTree.fromstring(read_bytes(path))
@@ -29,12 +31,12 @@ def load_materialx(path: Path, name: str) -> Material | None:
         return None
     link = material.find("./input[@name='surfaceshader']")
     shader = None if link is None else root.find(f"./standard_surface[@name='{link.get('nodename')}']")
-    return None if shader is None else _Shader(root, shader, path).material(name)
+    return None if shader is None else _Shader(root, shader, path, missing).material(name)
 
 
 class _Shader:
-    def __init__(self, root: Element, shader: Element, path: Path) -> None:
-        self.root, self.shader, self.path = root, shader, path
+    def __init__(self, root: Element, shader: Element, path: Path, missing: Missing) -> None:
+        self.root, self.shader, self.path, self.missing = root, shader, path, missing
 
     def material(self, name: str) -> Material:
         base, rough, metal = (self._texture(k) for k in ("base_color", "specular_roughness", "metalness"))
@@ -80,7 +82,10 @@ class _Shader:
         file = node.find("./input[@name='file']")
         if file is None or not file.get("value"):
             return None
-        pixels = images.read(resolve(file.get("value", ""), self.path))
+        reference = file.get("value", "")
+        pixels = self.missing.read(lambda: images.read(resolve(reference, self.path)))
+        if pixels is None:
+            return None
         space = "srgb" if "srgb" in file.get("colorspace", "") else "linear"
         if node.get("type") == "float":
             pixels = pixels[..., :1]

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from appearance_opt.asset import images
+from appearance_opt.asset.missing import Missing, MissingTextures
 from appearance_opt.asset.packing import pack_orm
 from appearance_opt.asset.paths import read_bytes, replacing, resolve
 from appearance_opt.asset.types import Asset, Material, Mesh, Texture
@@ -28,11 +29,11 @@ MAX_INDEX = 2**31 - 1
 """Largest index of a face's corner (they are kept in 32 bits)."""
 
 
-def load_obj(path: Path) -> Asset:
+def load_obj(path: Path, missing_textures: MissingTextures = "error") -> Asset:
     """Read an OBJ file and its materials. Raises InputError."""
     path = Path(path)
     text = read_bytes(path).decode("utf-8", errors="replace").replace("\\\n", " ")
-    parser = _Parser(path)
+    parser = _Parser(path, missing_textures)
     for number, line in enumerate(text.splitlines(), 1):
         try:
             parser.line(line)
@@ -42,7 +43,7 @@ def load_obj(path: Path) -> Asset:
 
 
 class _Parser:
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, missing_textures: MissingTextures) -> None:
         self.path = path
         self.positions: list[list[float]] = []
         self.uvs: list[list[float]] = []
@@ -51,6 +52,7 @@ class _Parser:
         self.current: list[tuple[int, int, int]] = self.corners.setdefault("", [])
         self.materials: dict[str, Material] = {}
         self.notes: list[str] = []
+        self.missing = Missing(missing_textures, self.notes)
 
     def line(self, line: str) -> None:
         words = line.split()
@@ -73,7 +75,7 @@ class _Parser:
             self.current = self.corners.setdefault(line.split(None, 1)[1].strip(), [])
         elif key == "mtllib":
             name = line.split(None, 1)[1].strip()
-            self.materials.update(load_mtl(resolve(name, self.path), self.notes))
+            self.materials.update(load_mtl(resolve(name, self.path), self.notes, self.missing))
 
     def _corner(self, word: str) -> tuple[int, int, int]:
         parts = word.split("/")
@@ -124,7 +126,7 @@ class _Parser:
         )
 
 
-def load_mtl(path: Path, notes: list[str]) -> dict[str, Material]:
+def load_mtl(path: Path, notes: list[str], missing: Missing) -> dict[str, Material]:
     """Materials of an MTL file by name. Phong exponents become roughness sqrt(2 / (Ns + 2))."""
     out: dict[str, Material] = {}
     statements: dict[str, dict[str, str]] = {}
@@ -139,19 +141,19 @@ def load_mtl(path: Path, notes: list[str]) -> dict[str, Material]:
             current[words[0].lower()] = words[1].strip()
     for name, values in statements.items():
         try:
-            out[name] = _material(name, values, path, notes)
+            out[name] = _material(name, values, path, notes, missing)
         except (ValueError, IndexError):
             raise InputError(f"{path}: a value of material '{name}' is missing or not a number") from None
     return out
 
 
-def _material(name: str, values: dict[str, str], path: Path, notes: list[str]) -> Material:
+def _material(name: str, values: dict[str, str], path: Path, notes: list[str], missing: Missing) -> Material:
     def numbers(key: str, default: list[float]) -> list[float]:
         return [float(w) for w in values[key].split()[:3]] if key in values else default
 
     def texture(*keys: str, space: str = "linear") -> Texture | None:
         key = next((k for k in keys if k in values), None)
-        return None if key is None else _texture(values[key], path, space)
+        return None if key is None else missing.read(lambda: _texture(values[key], path, space))
 
     color = numbers("kd", [0.8, 0.8, 0.8])
     color = color * 3 if len(color) == 1 else color

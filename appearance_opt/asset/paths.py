@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 from urllib.parse import unquote, urlparse
 
-from appearance_opt.errors import InputError
+from appearance_opt.errors import InputError, MissingFileError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 def resolve(reference: str, owner: Path, percent_encoded: bool = False) -> Path:
     """Path of a file that ``owner`` refers to. Raises InputError when it lies outside owner's folder (an
-    asset must not read what it does not own) or does not exist."""
+    asset must not read what it does not own), MissingFileError when it does not exist."""
     text = unquote(reference) if percent_encoded else reference
     if "\0" in text or (urlparse(text).scheme and len(urlparse(text).scheme) > 1):
         raise InputError(f"{owner}: refers to '{reference}', which is not a file beside it")
@@ -30,7 +30,7 @@ def resolve(reference: str, owner: Path, percent_encoded: bool = False) -> Path:
     if not path.is_relative_to(root):
         raise InputError(f"{owner}: refers to '{reference}' outside its own folder; copy the file beside it")
     if not exists:
-        raise InputError(f"{owner}: refers to '{reference}', which does not exist")
+        raise MissingFileError(f"{owner}: refers to '{reference}', which does not exist")
     return path
 
 

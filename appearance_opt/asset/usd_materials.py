@@ -12,11 +12,14 @@ from appearance_opt.asset.materialx import load_materialx
 from appearance_opt.asset.packing import pack_orm
 from appearance_opt.asset.paths import resolve
 from appearance_opt.asset.types import Material, Texture
+from appearance_opt.errors import MissingFileError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from numpy.typing import NDArray
+
+    from appearance_opt.asset.missing import Missing
 
 _WRAPS = {"repeat": "repeat", "clamp": "clamp", "mirror": "mirror", "black": "clamp"}
 _CHANNEL = {"r": 0, "g": 1, "b": 2, "a": 3}
@@ -25,8 +28,8 @@ _CHANNEL = {"r": 0, "g": 1, "b": 2, "a": 3}
 class MaterialReader:
     """Materials of a stage, each read once."""
 
-    def __init__(self, stage: Any, path: Path, notes: list[str]) -> None:
-        self.stage, self.path, self.notes = stage, path, notes
+    def __init__(self, stage: Any, path: Path, missing: Missing) -> None:
+        self.stage, self.path, self.missing, self.notes = stage, path, missing, missing.notes
         self._materials: dict[str, Material] = {}
         self._pixels: dict[str, NDArray] = {}
 
@@ -105,7 +108,7 @@ class MaterialReader:
                 if not dependency.endswith(".mtlx") or not layer.realPath:
                     continue
                 file = resolve(str((Path(layer.realPath).parent / dependency).relative_to(root)), self.path)
-                found = load_materialx(file, name)
+                found = load_materialx(file, name, self.missing)
                 if found is not None:
                     self.notes.append(f"material '{name}' read from {file.name}: subsurface and coat ignored")
                     return found
@@ -130,7 +133,7 @@ class MaterialReader:
                     node = UsdShade.Shader(attributes[0].GetPrim())
                     output = UsdShade.Output(attributes[0]).GetBaseName()
                     if str(node.GetIdAttr().Get()) == "UsdUVTexture":
-                        return default, node, output
+                        return _constant(source, node, output, default), node, output
                     # a primvar reader: the mesh's vertex colours take its place
                     return ((1.0, 1.0, 1.0) if key == "diffuseColor" else default), None, ""
             value = _value(source)
@@ -143,24 +146,27 @@ class MaterialReader:
         opacity, _, _ = of("opacity", 1.0)
         if float(opacity) < 1:
             self.notes.append(f"material '{name}': transparency ignored, drawn opaque")
+        base = self._texture(color_map, "srgb") if color_map else None
         rough = self._texture(rough_map, "linear", rough_channel) if rough_map else None
         metal = self._texture(metal_map, "linear", metal_channel) if metal_map else None
-        r, g, b = (1.0, 1.0, 1.0) if color_map else (float(x) for x in color)
+        r, g, b = (1.0, 1.0, 1.0) if base else (float(x) for x in color)
         return Material(
             name=name,
             base_color=(r, g, b),
             roughness=1.0 if rough else float(roughness),
             metalness=1.0 if metal else float(metalness),
-            base_color_texture=self._texture(color_map, "srgb") if color_map else None,
+            base_color_texture=base,
             orm_texture=pack_orm(rough, metal) if rough or metal else None,
             normal_texture=self._texture(normal_map, "linear") if normal_map else None,
             opacity=float(opacity),
         )
 
-    def _texture(self, node: Any, space: str, channel: str = "rgb") -> Texture:
+    def _texture(self, node: Any, space: str, channel: str = "rgb") -> Texture | None:
         asset = _value(node.GetInput("file"))
         text = asset.resolvedPath or asset.path if asset is not None else ""
-        pixels = self._image(text)
+        pixels = self.missing.read(lambda: self._image(text))
+        if pixels is None:
+            return None
         encoding = str(_value(node.GetInput("sourceColorSpace")) or "auto")
         if encoding == "raw":
             space = "linear"
@@ -179,8 +185,9 @@ class MaterialReader:
                 from pxr import Ar
 
                 opened = Ar.GetResolver().OpenAsset(Ar.ResolvedPath(text))
-                data = bytes(opened.GetBuffer()) if opened else b""
-                self._pixels[text] = images.decode(data, text)
+                if not opened:
+                    raise MissingFileError(f"{self.path}: refers to '{text}', which does not exist")
+                self._pixels[text] = images.decode(bytes(opened.GetBuffer()), text)
             else:
                 root = self.path.resolve().parent
                 path = Path(text)
@@ -188,6 +195,17 @@ class MaterialReader:
                 reference = str(path.resolve().relative_to(root)) if inside else text
                 self._pixels[text] = images.read(resolve(reference, self.path))
         return self._pixels[text]
+
+
+def _constant(source: Any, node: Any, output: str, default: Any) -> Any:
+    """What an input is worth without its texture: its own value, or the texture's fallback."""
+    value = source.Get()
+    if value is not None:
+        return value
+    fallback = _value(node.GetInput("fallback"))
+    if fallback is None:
+        return default
+    return fallback[_CHANNEL[output]] if output in _CHANNEL else tuple(fallback)[:3]
 
 
 def _descendants(prim: Any) -> Any:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from appearance_opt.asset.missing import Missing, MissingTextures
 from appearance_opt.asset.paths import read_bytes
 from appearance_opt.asset.subdivide import Polygons, catmull_clark, triangulate
 from appearance_opt.asset.types import Asset, Mesh
@@ -28,7 +29,12 @@ _TO_Y_UP = {
 }
 
 
-def load_usd(path: Path, refine: int = 1, variants: dict[str, str] | None = None) -> Asset:
+def load_usd(
+    path: Path,
+    refine: int = 1,
+    variants: dict[str, str] | None = None,
+    missing_textures: MissingTextures = "error",
+) -> Asset:
     """Read a stage at its default time, variants at their selection (or as ``variants`` says: set name ->
     variant, on the default prim). Catmull-Clark and Loop meshes are refined ``refine`` times. Raises
     InputError."""
@@ -39,7 +45,7 @@ def load_usd(path: Path, refine: int = 1, variants: dict[str, str] | None = None
     # USD prints what it warns of; here it becomes notes
     diagnostics = UsdUtils.CoalescingDiagnosticDelegate()
     try:
-        asset = _read_stage(path, refine, variants or {})
+        asset = _read_stage(path, refine, variants or {}, missing_textures)
     except Tf.ErrorException as error:
         raise InputError(f"{path}: not a readable USD file ({_text(error.__str__)})") from None
     except (KeyError, IndexError, TypeError, ValueError, RuntimeError, OverflowError) as error:
@@ -49,7 +55,7 @@ def load_usd(path: Path, refine: int = 1, variants: dict[str, str] | None = None
     return replace(asset, notes=asset.notes + tuple(f"USD: {text}" for text in dict.fromkeys(warned)))
 
 
-def _read_stage(path: Path, refine: int, variants: dict[str, str]) -> Asset:
+def _read_stage(path: Path, refine: int, variants: dict[str, str], missing_textures: MissingTextures) -> Asset:
     from pxr import Usd
 
     stage = Usd.Stage.Open(str(path))
@@ -57,7 +63,7 @@ def _read_stage(path: Path, refine: int, variants: dict[str, str]) -> Asset:
         raise InputError(f"{path}: not a readable USD file")
     _select(stage, variants, path)
     _refuse_escapes(stage, path)
-    return _Reader(stage, path, refine).asset()
+    return _Reader(stage, path, refine, missing_textures).asset()
 
 
 def _select(stage: Any, variants: dict[str, str], path: Path) -> None:
@@ -83,7 +89,7 @@ def _refuse_escapes(stage: Any, path: Path) -> None:
 
 
 class _Reader:
-    def __init__(self, stage: Any, path: Path, refine: int) -> None:
+    def __init__(self, stage: Any, path: Path, refine: int, missing_textures: MissingTextures) -> None:
         from pxr import UsdGeom
 
         self.stage, self.path, self.refine = stage, path, refine
@@ -91,7 +97,7 @@ class _Reader:
         self.up = str(UsdGeom.GetStageUpAxis(stage))
         self.unit = float(UsdGeom.GetStageMetersPerUnit(stage))
         self.to_metres = _TO_Y_UP[self.up] * self.unit
-        self.materials = MaterialReader(stage, path, self.notes)
+        self.materials = MaterialReader(stage, path, Missing(missing_textures, self.notes))
         self.cache = UsdGeom.XformCache()
 
     def asset(self) -> Asset:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from appearance_opt import backend
-from appearance_opt.asset import load, save
+from appearance_opt.asset import save
 from appearance_opt.asset.paths import replacing
 from appearance_opt.errors import DivergedError, InputError
 
@@ -71,13 +71,12 @@ def bake(
     Raises AppearanceError.
     """
     from appearance_opt.jobs.fitting import Stopwatch, conclude
-    from appearance_opt.jobs.simplify import check_paths
+    from appearance_opt.jobs.simplify import check_paths, loaded
 
     watch = Stopwatch(began)
     for source in (high, low):
         check_paths(source, out, report)
-    heavy = load(high, refine=options.refine, variants=variants) if isinstance(high, (str, Path)) else high
-    light = load(low, refine=options.refine) if isinstance(low, (str, Path)) else low
+    heavy, light = loaded(high, options, variants), loaded(low, options)
     watch.lap("load")
     run = BakeJob(heavy, light, str(low) if isinstance(low, (str, Path)) else light.name, options, watch)
     result, error = run.run(progress, report is not None)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,6 +13,7 @@ from appearance_opt import backend
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from appearance_opt.asset.missing import MissingTextures
     from appearance_opt.asset.types import Asset
     from appearance_opt.evaluate.metrics import Metrics
     from appearance_opt.views import Views, ViewSampler
@@ -23,11 +24,13 @@ HELD_OUT_STREAM = 3
 
 @dataclass
 class Comparison:
-    """``metrics`` over the views; images (B, H, W, 4) premultiplied linear radiance and coverage."""
+    """``metrics`` over the views; images (B, H, W, 4) premultiplied linear radiance and coverage; ``notes``: what the
+    loader dropped, repaired or assumed."""
 
     metrics: Metrics
     reference: NDArray[np.float32]
     candidate: NDArray[np.float32]
+    notes: tuple[str, ...] = ()
 
 
 def compare(
@@ -40,14 +43,15 @@ def compare(
     seed: int = 0,
     device: str = "auto",
     out: str | Path | None = None,
+    missing_textures: MissingTextures = "error",
 ) -> Comparison:
     """Render both assets from ``views`` random cameras under random lights and measure the difference.
-    ``out``: folder for a report with pictures. Raises AppearanceError."""
+    ``out``: folder for a report with pictures. ``missing_textures``: see ``load``. Raises AppearanceError."""
     from appearance_opt.asset import load
     from appearance_opt.asset.types import Asset
 
-    first = reference if isinstance(reference, Asset) else load(reference)
-    second = candidate if isinstance(candidate, Asset) else load(candidate)
+    first = reference if isinstance(reference, Asset) else load(reference, missing_textures=missing_textures)
+    second = candidate if isinstance(candidate, Asset) else load(candidate, missing_textures=missing_textures)
     backend.select(device)
     from appearance_opt.jobs.simplify import in_frame, support
     from appearance_opt.views import ViewSampler, framing
@@ -61,7 +65,7 @@ def compare(
         from appearance_opt.jobs.report import write_compare_report
 
         write_compare_report(Path(out), first, second, result)
-    return result
+    return replace(result, notes=(*first.notes, *second.notes))
 
 
 def compare_in_frame(
@@ -71,8 +75,8 @@ def compare_in_frame(
     from appearance_opt.evaluate.metrics import compare_images
 
     drawn = sampler.draw(0, views)
-    images = [render_asset(a, drawn, resolution, samples) for a in (reference, candidate)]
-    return Comparison(compare_images(*images), *images)
+    first, second = (render_asset(a, drawn, resolution, samples) for a in (reference, candidate))
+    return Comparison(compare_images(first, second), first, second)
 
 
 def render_asset(asset: Asset, views: Views, resolution: int, samples: int) -> NDArray[np.float32]:

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from appearance_opt.asset import load, save
-from appearance_opt.jobs.simplify import SimplifyResult, check_paths
+from appearance_opt.asset import save
+from appearance_opt.jobs.simplify import SimplifyResult, check_paths, loaded
 
 if TYPE_CHECKING:
     from appearance_opt.asset.types import Asset
@@ -41,8 +41,7 @@ def joint(
     watch = Stopwatch(began)
     for source in (high, low):
         check_paths(source, out, report)
-    heavy = load(high, refine=options.refine, variants=variants) if isinstance(high, (str, Path)) else high
-    light = load(low, refine=options.refine) if isinstance(low, (str, Path)) else low
+    heavy, light = loaded(high, options, variants), loaded(low, options)
     require_memory(light.triangle_count, options)
     watch.lap("load")
     job = BakeJob(heavy, light, str(low) if isinstance(low, (str, Path)) else light.name, options, watch)

@@ -13,7 +13,7 @@ import numpy as np
 
 from appearance_opt import backend
 from appearance_opt.asset import check_folder, check_writable, load, save
-from appearance_opt.config import SimplifyOptions, as_dict, with_values
+from appearance_opt.config import CommonOptions, SimplifyOptions, as_dict, with_values
 from appearance_opt.errors import DivergedError, InputError
 
 if TYPE_CHECKING:
@@ -77,7 +77,7 @@ def simplify(
 
     watch = Stopwatch(began)
     check_paths(source, out, report, checkpoint)
-    asset = load(source, refine=options.refine, variants=variants) if isinstance(source, (str, Path)) else source
+    asset = loaded(source, options, variants)
     watch.lap("load")
     backend.select(options.device)
     run = _Job(asset, options, watch, progress, _checkpointer(asset, options, checkpoint, resume), report is not None)
@@ -104,6 +104,13 @@ def simplify(
 
     conclude(result, watch, None if report is None else write_report)
     return result
+
+
+def loaded(source: str | Path | Asset, options: CommonOptions, variants: dict[str, str] | None = None) -> Asset:
+    """``source`` itself, or the file of that name, read as the options say."""
+    if not isinstance(source, (str, Path)):
+        return source
+    return load(source, refine=options.refine, variants=variants, missing_textures=options.missing_textures)
 
 
 def check_paths(

@@ -173,7 +173,8 @@ def loaded_start(
     from appearance_opt.asset import load
     from appearance_opt.asset.normals import weld
 
-    asset = load(path, refine=options.refine)
+    # its own maps are not used: it may lack them
+    asset = load(path, refine=options.refine, missing_textures="ignore")
     most = None if options.triangles is None and options.ratio is None else budget(options, len(reference.merged.faces))
     if most is not None and asset.triangle_count > most:
         raise InputError(f"--init {path}: has {asset.triangle_count} triangles, more than the {most} asked for")
