@@ -3,7 +3,8 @@
 The metric is Garland and Heckbert's, with faces weighted by area times an importance that the caller
 gives: how much of the face an observer sees. Instead of one collapse at a time, each round collapses all
 cheap edges that are the cheapest of their neighbourhood; their neighbourhoods do not touch, so a round is a
-handful of array operations. What libraries do instead, and why it was not enough, is in docs/design.md.
+handful of array operations. Far from the budget, rounds are bolder: see ``BOLD``. What libraries do instead, and
+why it was not enough, is in docs/design.md.
 """
 
 from __future__ import annotations
@@ -33,6 +34,22 @@ time, and slower. Early rounds, far from the budget, can be bolder: what they co
 
 EARLY = 6
 """Rounds are early while there are more than this many times the budget of triangles."""
+
+BOLD, LARGE = 16, 50_000
+"""Rounds are bold while there are more than this many times the budget of triangles, and more than ``LARGE``: smaller
+meshes are quick anyway."""
+
+ALIKE = 4.0
+"""In bold rounds, costs within this factor of one another count as equal, and such edges are taken in random order.
+Costs vary smoothly over a fine mesh, so that few edges are the very cheapest around: a round would collapse 1 % of all
+edges, and collapses 4 %."""
+
+BOLD_PASSES = 6
+"""How often a bold round chooses among the edges whose neighbourhoods are still free (Luby 1986). A pass costs a tenth
+of what the costs do. In late rounds it would take expensive edges beside cheap ones: they choose once."""
+
+BLOCK = 1 << 15
+"""Edges whose costs are computed at once: their quadrics fit into a core's cache."""
 
 
 @dataclass
@@ -113,45 +130,78 @@ def _round(state: _State, triangles: int, strict: bool) -> bool:
     """Collapse an independent set of cheap edges. False when there is nothing left to try."""
     edges, uses = _edges(state.faces)
     keys = _keys(edges[:, 0], edges[:, 1])
-    free = ~np.isin(keys, state.blocked)
-    edges, uses, keys = edges[free], uses[free], keys[free]
+    if len(state.blocked):
+        free = ~np.isin(keys, state.blocked)
+        edges, uses, keys = edges[free], uses[free], keys[free]
     if not len(edges):
         return False
-    a, b = edges.T
-    q = state.quadrics[a] + state.quadrics[b]
-    target = quadrics.minimize(q, (state.positions[a] + state.positions[b]) / 2)
-    cost = quadrics.evaluate(q, target)
-    # between a sum over the surface (which gives small parts away) and a mean (which forgets large ones)
-    cost /= np.sqrt(np.maximum(q[:, 0] + q[:, 3] + q[:, 5], 1e-300))
+    target, cost = _costs(state, edges)
     needed = (len(state.faces) - triangles + 1) // 2
+    bold = len(state.faces) > max(BOLD * triangles, LARGE)
     fraction = EARLY_FRACTION if len(state.faces) > EARLY * triangles else ROUND_FRACTION
     limit = min(max(int(fraction * len(edges)), min(needed, 16), 1), len(edges))
     cheap = np.argpartition(cost, limit - 1)[:limit]
-    # of edges that cost the same (nothing, in flat regions) the shorter go first
-    length = np.sum((state.positions[a[cheap]] - state.positions[b[cheap]]) ** 2, axis=1)
     rank = np.full(len(edges), len(edges))
-    rank[cheap[np.lexsort((length, cost[cheap]))]] = np.arange(limit)
-    chosen = _independent(state, edges, rank, limit)
+    rank[cheap[_order(state, edges[cheap], cost[cheap], bold)]] = np.arange(limit)
+    chosen = _independent(state, edges, rank, limit, BOLD_PASSES if bold else 1)
     legal = _legal(state, edges[chosen], target[chosen], uses[chosen], strict)
     state.blocked = np.concatenate([state.blocked, keys[chosen[~legal]]])
     chosen = chosen[legal]
     chosen = chosen[np.argsort(rank[chosen])][:needed]
-    _collapse(state, edges[chosen], target[chosen], q[chosen])
+    _collapse(state, edges[chosen], target[chosen])
     return True
 
 
-def _independent(state: _State, edges: NDArray, rank: NDArray, limit: int) -> NDArray:
-    """Edges of rank below ``limit`` that are the best around both of their ends: no other chosen edge
-    touches a vertex of the faces that they change."""
+def _costs(state: _State, edges: NDArray) -> tuple[NDArray, NDArray]:
+    """(where each edge would collapse to (E, 3), what it costs (E,))."""
+    target, cost = np.empty((len(edges), 3)), np.empty(len(edges))
+    for start in range(0, len(edges), BLOCK):
+        here = slice(start, start + BLOCK)
+        a, b = edges[here].T
+        q = state.quadrics[a] + state.quadrics[b]
+        target[here] = quadrics.minimize(q, (state.positions[a] + state.positions[b]) / 2)
+        # between a sum over the surface (which gives small parts away) and a mean (which forgets large ones)
+        size = np.sqrt(np.maximum(q[:, 0] + q[:, 3] + q[:, 5], 1e-300))
+        cost[here] = quadrics.evaluate(q, target[here]) / size
+    return target, cost
+
+
+def _order(state: _State, edges: NDArray, cost: NDArray, bold: bool) -> NDArray:
+    """Indices of edges in the order in which they are to be collapsed."""
+    if bold:
+        order = np.random.default_rng(0).permutation(len(edges))
+        level = np.floor(np.log(cost + 1e-300) / np.log(ALIKE))
+        return order[np.argsort(level[order], kind="stable")]
+    # of edges that cost the same (nothing, in flat regions) the shorter go first
+    length = np.sum((state.positions[edges[:, 0]] - state.positions[edges[:, 1]]) ** 2, axis=1)
+    return np.lexsort((length, cost))
+
+
+def _independent(state: _State, edges: NDArray, rank: NDArray, limit: int, passes: int) -> NDArray:
+    """Edges of rank below ``limit`` that are the best around both of their ends, ``passes`` times over: no other
+    chosen edge touches a vertex of the faces that they change."""
     n = len(state.positions)
-    best = np.full(n, np.iinfo(np.int64).max)
-    np.minimum.at(best, edges[:, 0], rank)
-    np.minimum.at(best, edges[:, 1], rank)
-    face_best = best[state.faces].min(axis=1)
-    ring = best.copy()
-    for k in range(3):
-        np.minimum.at(ring, state.faces[:, k], face_best)
-    return np.flatnonzero((rank < limit) & (ring[edges[:, 0]] == rank) & (ring[edges[:, 1]] == rank))
+    faces, left = state.faces, np.flatnonzero(rank < limit)
+    chosen = []
+    for _ in range(passes):
+        e, r = edges[left], rank[left]
+        best = np.full(n, np.iinfo(np.int64).max)
+        np.minimum.at(best, e[:, 0], r)
+        np.minimum.at(best, e[:, 1], r)
+        face_best = np.minimum(np.minimum(best[faces[:, 0]], best[faces[:, 1]]), best[faces[:, 2]])
+        ring = best.copy()
+        for k in range(3):
+            np.minimum.at(ring, faces[:, k], face_best)
+        won = (ring[e[:, 0]] == r) & (ring[e[:, 1]] == r)
+        chosen.append(left[won])
+        near = np.zeros(n, bool)
+        near[e[won].ravel()] = True
+        changed = _touching(near, faces)
+        near[faces[changed].ravel()] = True
+        faces, left = faces[~changed], left[~(near[e[:, 0]] | near[e[:, 1]])]
+        if not len(left):
+            break
+    return np.concatenate(chosen)
 
 
 def _legal(state: _State, edges: NDArray, target: NDArray, uses: NDArray, strict: bool) -> NDArray[np.bool_]:
@@ -163,9 +213,8 @@ def _legal(state: _State, edges: NDArray, target: NDArray, uses: NDArray, strict
     owner = np.full(len(state.positions), -1, np.int64)
     owner[edges[:, 0]] = np.arange(n)
     owner[edges[:, 1]] = np.arange(n)
-    owned = owner[state.faces]
-    touching = np.flatnonzero((owned >= 0).any(axis=1))
-    faces, owned = state.faces[touching], owned[touching]
+    faces = state.faces[_touching(owner >= 0, state.faces)]
+    owned = owner[faces]
     which = owned.max(axis=1)  # chosen edges share no face: each face has one owner
     inside = (owned >= 0).sum(axis=1)
     legal = _link_condition(faces, which, inside, edges, uses)
@@ -189,27 +238,28 @@ def _link_condition(
     kept = inside == 1
     f, w = faces[kept], which[kept]
     ends = edges[w]
-    pairs = []
-    for k in range(3):
-        other = f[:, k]
-        is_end = (other == ends[:, 0]) | (other == ends[:, 1])
-        end = np.where((f == ends[:, :1]).any(axis=1), 0, 1)
-        pairs.append(np.stack([w, other, end], axis=1)[~is_end])
+    end = np.where((f == ends[:, :1]).any(axis=1), 0, 1)
     two = faces[inside == 2]
     own = which[inside == 2]
     third = two[(two != edges[own, :1]) & (two != edges[own, 1:])]
-    pairs += [np.stack([own, third, np.full(len(own), side)], axis=1) for side in (0, 1)]
-    neighbours = np.unique(np.concatenate(pairs), axis=0)
-    same = (neighbours[1:, :2] == neighbours[:-1, :2]).all(axis=1)
-    common = np.bincount(neighbours[1:][same, 0], minlength=len(edges))
+    # one number per (chosen edge, neighbour, end that has it): twice the same edge and neighbour is a common one
+    n = int(faces.max(initial=0)) + 1
+    pairs = [2 * (own * n + third) + side for side in (0, 1)]
+    for k in range(3):
+        other = f[:, k]
+        is_end = (other == ends[:, 0]) | (other == ends[:, 1])
+        pairs.append((2 * (w * n + other) + end)[~is_end])
+    found = np.sort(np.concatenate(pairs))
+    found = found[np.concatenate([[True], found[1:] != found[:-1]])[: len(found)]] // 2
+    common = np.bincount(found[1:][found[1:] == found[:-1]] // n, minlength=len(edges))
     # a part that is down to a tetrahedron or a triangle must not collapse any further
     around = np.bincount(which[kept], minlength=len(edges))
     return (common == uses) & (uses <= 2) & (around > 2)
 
 
-def _collapse(state: _State, edges: NDArray, target: NDArray, q: NDArray) -> None:
+def _collapse(state: _State, edges: NDArray, target: NDArray) -> None:
     state.positions[edges[:, 0]] = target
-    state.quadrics[edges[:, 0]] = q
+    state.quadrics[edges[:, 0]] += state.quadrics[edges[:, 1]]
     new = np.arange(len(state.positions))
     new[edges[:, 1]] = edges[:, 0]
     f = new[state.faces]
@@ -219,7 +269,7 @@ def _collapse(state: _State, edges: NDArray, target: NDArray, q: NDArray) -> Non
     moved = np.zeros(len(state.positions), bool)
     moved[edges[:, 0]] = True
     near = moved.copy()
-    near[state.faces[moved[state.faces].any(axis=1)].ravel()] = True
+    near[state.faces[_touching(moved, state.faces)].ravel()] = True
     gone = new[state.blocked >> 32] != state.blocked >> 32
     gone |= new[state.blocked & 0xFFFFFFFF] != state.blocked & 0xFFFFFFFF
     state.blocked = state.blocked[~(gone | near[state.blocked >> 32] | near[state.blocked & 0xFFFFFFFF])]
@@ -241,6 +291,11 @@ def _drop_smallest_parts(state: _State, triangles: int) -> None:
     excess = len(f) - triangles
     gone = np.cumsum(count[order]) - count[order] < excess
     state.faces = f[~np.isin(label, order[gone])]
+
+
+def _touching(marked: NDArray[np.bool_], faces: NDArray) -> NDArray[np.bool_]:
+    """(F,) faces with a marked vertex."""
+    return marked[faces[:, 0]] | marked[faces[:, 1]] | marked[faces[:, 2]]
 
 
 def _edges(faces: NDArray) -> tuple[NDArray, NDArray]:
