@@ -14,12 +14,13 @@ import mitsuba as mi
 import numpy as np
 
 from appearance_opt.baking.curvature import mean_curvature
-from appearance_opt.baking.occlusion import openness
+from appearance_opt.baking.occlusion import exposed, openness
 from appearance_opt.baking.points import Points, TexelPoints, interpolate_packets
 from appearance_opt.baking.search import Found, Pick, automatic_reach, find
 from appearance_opt.initial.fill import fill
 from appearance_opt.render import upload
 from appearance_opt.render.rays import sub_pixel_offsets
+from appearance_opt.render.surface import face_normal
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -45,7 +46,9 @@ FAR = 4.0
 @dataclass(frozen=True)
 class Settings:
     """What to bake and how. ``fields``: names of ``FIELDS``. ``samples``: rays per texel. ``reach``: how far
-    rays go outward and inward, None for the automatic cage. Lengths in units of the frame."""
+    rays go outward and inward, None for the automatic cage. ``fill_hidden``: texels that nothing outside can see, or
+    whose point of the reference nothing can see, are filled from their neighbours: where parts touch, two surfaces
+    coincide, and rays would find one or the other at random. Lengths in units of the frame."""
 
     size: int
     fields: tuple[str, ...] = ("material", "normal")
@@ -54,17 +57,20 @@ class Settings:
     pick: Pick = "nearest"
     ao_rays: int = 64
     ao_distance: float = float("inf")
+    fill_hidden: bool = False
 
 
 @dataclass(frozen=True)
 class BakedMaps:
     """``maps``: channel name -> (size, size) float32, natural units (linear colours, normals in [-1, 1],
     lengths in units of the frame), filled everywhere. ``covered``: texels that belong to a triangle of the
-    atlas. ``missed``: those among them whose rays found nothing. ``reach``: how far rays went."""
+    atlas. ``missed``: those among them whose rays found nothing. ``hidden``: those that nothing outside
+    can see, if that was asked for (they do not count as missed). ``reach``: how far rays went."""
 
     maps: dict[str, NDArray[np.float32]]
     covered: NDArray[np.bool_]
     missed: NDArray[np.bool_]
+    hidden: NDArray[np.bool_]
     reach: float
 
     @property
@@ -78,7 +84,7 @@ def bake(reference: MeshReference, mesh: LatentMesh, settings: Settings) -> Bake
     size = settings.size
     names = [c for f in settings.fields for c in FIELDS[f]]
     values = np.empty((size, size, len(names)), np.float32)
-    found, covered = np.empty((size, size), bool), np.empty((size, size), bool)
+    found, covered, hidden = (np.empty((size, size), bool) for _ in range(3))
     with dr.suspend_grad():
         reach = automatic_reach(reference, mesh) if settings.reach is None else settings.reach
         run = _Run(reference, TexelPoints(mesh, size, settings.samples), settings, reach)
@@ -87,7 +93,8 @@ def bake(reference: MeshReference, mesh: LatentMesh, settings: Settings) -> Bake
             here = slice(row, row + len(sums))
             hits = sums[..., len(names)]
             values[here] = sums[..., : len(names)] / np.maximum(hits, 1)[..., None]
-            found[here], covered[here] = hits > 0, sums[..., len(names) + 1] > 0
+            found[here], covered[here], hidden[here] = (sums[..., len(names) + k] > 0 for k in range(3))
+    hidden &= ~found
     maps: dict[str, NDArray[np.float32]] = {}
     start = 0
     for field in settings.fields:
@@ -98,7 +105,7 @@ def bake(reference: MeshReference, mesh: LatentMesh, settings: Settings) -> Bake
             own = own / np.maximum(np.linalg.norm(own, axis=-1, keepdims=True), 1e-6)
         filled = fill(own, found)
         maps.update({c: np.ascontiguousarray(filled[..., k]) for k, c in enumerate(channels)})
-    return BakedMaps(maps, covered, covered & ~found, reach)
+    return BakedMaps(maps, covered, covered & ~found & ~hidden, hidden, reach)
 
 
 class _Run:
@@ -107,14 +114,15 @@ class _Run:
     def __init__(self, reference: MeshReference, points: TexelPoints, settings: Settings, reach: float) -> None:
         self.reference, self.points, self.settings = reference, points, settings
         self.reach = dr.opaque(mi.Float, reach)
-        self.width = 1 << (sum(len(FIELDS[f]) for f in settings.fields) + 1).bit_length()
+        self.width = 1 << (sum(len(FIELDS[f]) for f in settings.fields) + 2).bit_length()
         self.curvature: mi.Float | None = None
         if "curvature" in settings.fields:
             merged = reference.merged
             self.curvature = upload.packets(1, mean_curvature(merged.positions, merged.faces))
 
     def band(self, row: int) -> NDArray[np.float32]:
-        """(rows, size, width) sums over the samples of each texel: channels, hits, samples inside a chart."""
+        """(rows, size, width) sums over the samples of each texel: channels, hits, samples inside a chart, hits that
+        nothing outside can see (which count as no hits)."""
         rows, size = self.points.rows, self.points.size
         total = dr.zeros(mi.Float, rows * size * self.width)
         for k, (dx, dy) in enumerate(sub_pixel_offsets(self.settings.samples)):
@@ -126,12 +134,27 @@ class _Run:
     def _add(self, total: mi.Float, points: Points, seed: int) -> None:
         found = find(self.reference, points, self.reach, self.settings.pick)
         dr.eval(found, points)
+        hidden = mi.Bool(False)
+        if self.settings.fill_hidden:
+            hidden = self._hidden(points, found)
+            found.valid &= ~hidden
         rows = [dr.select(found.valid, x, 0) for x in self._values(points, found, seed)]
-        rows += [dr.select(found.valid, mi.Float(1), 0), mi.Float(1)]
+        rows += [dr.select(found.valid, mi.Float(1), 0), mi.Float(1), dr.select(hidden, mi.Float(1), 0)]
         rows += [mi.Float(0)] * (self.width - len(rows))
         # one sample of each texel: no two threads meet
         dr.scatter_reduce(dr.ReduceOp.Add, total, mi.ArrayXf(rows), points.texel, mode=dr.ReduceMode.NoConflicts)
         dr.eval(total)
+
+    def _hidden(self, points: Points, found: Found) -> mi.Bool:
+        """Points of the mesh that nothing outside can see, or whose point of the reference nothing can see."""
+        flat = face_normal(self.points.surface, points.triangle, mi.Bool(True))
+        flat *= dr.rsqrt(dr.fmax(dr.squared_norm(flat), 1e-30))
+        all_ = dr.full(mi.Bool, True, dr.width(points.texel))
+        out = exposed(self.points.scene, points.here.position, flat, all_, FAR)
+        both = out & found.valid
+        prim = dr.select(found.valid, found.triangle, 0)
+        position, geometric, _ = self.reference.frame_at(prim, found.b1, found.b2)
+        return ~out | (both & ~exposed(self.reference.scene, position, geometric, both, FAR))
 
     def _values(self, points: Points, found: Found, seed: int) -> list[mi.Float]:
         """All channels of the wanted fields, in order."""

@@ -1,4 +1,4 @@
-"""Ambient occlusion at points of the heavy mesh."""
+"""Ambient occlusion at points of the heavy mesh, and which of them can be seen at all."""
 
 from __future__ import annotations
 
@@ -15,6 +15,11 @@ if TYPE_CHECKING:
 
 LIFT = 1e-4
 """How far rays start above the surface, in units of the object's radius (1 in the frame of a bake)."""
+
+TRIES = (1, 7, 24, 96)
+"""Directions in which a way out is looked for, in several goes: most points see the sky along their normal, and only
+those that have found no way out yet take part in the next go. A point visible from less than a hundredth of all
+directions may be taken for hidden."""
 
 
 def openness(
@@ -47,6 +52,30 @@ def openness(
         free += dr.select(hit, mi.Float(0), mi.Float(1))
         dr.eval(free)
     return free * dr.opaque(mi.Float, 1 / rays)
+
+
+def exposed(scene: mi.Scene, position: mi.Point3f, normal: mi.Vector3f, active: mi.Bool, far: float) -> mi.Bool:
+    """Which of the ``active`` points of a surface something outside can see, from either side: those from which some
+    ray gets away. Where parts touch, both surfaces are hidden. ``far``: a distance beyond which there is nothing."""
+    out = dr.zeros(mi.Bool, dr.width(position))
+    left = dr.compress(active)
+    length = dr.opaque(mi.Float, far)
+    for number, count in enumerate(TRIES):
+        if dr.width(left) == 0:
+            break
+        p, n = (dr.gather(type(x), x, left) for x in (position, normal))
+        hidden = dr.full(mi.Bool, True, dr.width(left))
+        dr.eval(p, n, hidden)
+        for x, y in sub_pixel_offsets(count):
+            # the same directions everywhere: what is hidden is of one piece
+            d = n if number == 0 else mi.warp.square_to_uniform_sphere(dr.opaque(mi.Point2f, (float(x), float(y))))
+            side = dr.select(dr.dot(d, n) < 0, mi.Float(-LIFT), mi.Float(LIFT))
+            hidden &= scene.ray_test(mi.Ray3f(dr.fma(n, side, p), d, length, 0, mi.Color0f()), active=hidden)
+            dr.eval(hidden)
+        dr.scatter(out, ~hidden, left)
+        left = dr.gather(mi.UInt32, left, dr.compress(hidden))
+        dr.eval(out, left)
+    return out
 
 
 def _hash(x: mi.UInt32) -> mi.UInt32:

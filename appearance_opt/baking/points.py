@@ -26,13 +26,14 @@ class Points:
     """Points of a mesh that lie under texels of one band, one per texel.
 
     ``texel``: index into the band; ``here``: attributes of the mesh; ``along``: unit direction of the
-    texel's ray; ``area``: world-space area that the point stands for.
+    texel's ray; ``area``: world-space area that the point stands for; ``triangle``: of the mesh.
     """
 
     texel: mi.UInt32
     here: Hit
     along: mi.Vector3f
     area: mi.Float
+    triangle: mi.UInt32
 
 
 class TexelPoints:
@@ -48,6 +49,7 @@ class TexelPoints:
         positions = np.ascontiguousarray(mesh.positions, np.float32)
         self.surface = LatentTopology(mesh, tangents=True).surface(mi.Float(positions.ravel()))
         self.atlas = atlas_scene(mesh)
+        self.scene = upload.scene_of(positions, mesh.faces)
         self._directions: mi.Float | None = None
         if mesh.normals is not None:
             self._directions = upload.packets(4, vertex_normals(positions, mesh.faces))
@@ -70,7 +72,7 @@ class TexelPoints:
         assert here.footprint is not None
         # the footprint of a unit area is the inverse of the area of the whole texture
         area = dr.square(scale) / (dr.fmax(here.footprint, 1e-20) * self.samples)
-        return Points(texel, here, self._direction(here, triangle, b1, b2), area)
+        return Points(texel, here, self._direction(here, triangle, b1, b2), area, triangle)
 
     def _direction(self, here: Hit, triangle: mi.UInt32, b1: mi.Float, b2: mi.Float) -> mi.Vector3f:
         if self._directions is None:

@@ -14,7 +14,7 @@ SAMPLES = 1
 """Rays per texel. More blur the maps: a texel is read bilinearly, which averages once already."""
 
 
-def transfer(reference: MeshReference, mesh: LatentMesh, size: int) -> BakedMaps:
+def transfer(reference: MeshReference, mesh: LatentMesh, size: int, fill_hidden: bool = True) -> BakedMaps:
     """Base colour, roughness, metalness and tangent-space normals of the reference in ``size`` x ``size``
-    maps of ``mesh``."""
-    return bake(reference, mesh, Settings(size, samples=SAMPLES))
+    maps of ``mesh``. ``fill_hidden``: smooth where nothing outside can see the reference."""
+    return bake(reference, mesh, Settings(size, samples=SAMPLES, fill_hidden=fill_hidden))

@@ -157,7 +157,7 @@ def transferred(reference: MeshReference, mesh: LatentMesh, options: SimplifyOpt
     displacement: dict[str, NDArray] = {}
     if options.displaced:
         finest, displacement = displaced(reference, mesh, options)
-    result = transfer(reference, mesh if finest is None else finest, options.texture_size)
+    result = transfer(reference, mesh if finest is None else finest, options.texture_size, not options.keep_hidden)
     missed = result.missed.sum() / max(result.covered.sum(), 1)
     if missed > 0.01:
         log.warning("the transfer found no reference point for %.1f %% of the texels; they were filled", 100 * missed)
