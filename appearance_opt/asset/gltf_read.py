@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from appearance_opt.asset import images
+from appearance_opt.asset import images, uv_frames
 from appearance_opt.asset.gltf_accessors import Document
 from appearance_opt.asset.missing import Missing, MissingTextures
 from appearance_opt.asset.types import Asset, Material, Mesh, Texture, Wrap
@@ -55,7 +56,7 @@ class _Reader:
         for kind, what in (("skins", "skins (bind pose kept)"), ("animations", "animations")):
             if self.document.items(kind):
                 self._note(f"{what} ignored")
-        return Asset(tuple(meshes), self.path.stem, tuple(self.notes))
+        return Asset(tuple(self._in_one_frame(meshes)), self.path.stem, tuple(self.notes))
 
     def _note(self, text: str) -> None:
         if text not in self.notes:
@@ -115,40 +116,60 @@ class _Reader:
             positions=(positions @ linear.T + world[:3, 3]).astype(np.float32),
             faces=np.ascontiguousarray(faces, np.int32),
             normals=_float(normals),
-            uvs=None if uvs is None else self._transformed(uvs.astype(np.float32), primitive.get("material")),
+            uvs=_float(uvs),
             tangents=_float(tangents),
             colors=colors,
             material=material,
             name=name,
         )
 
-    def _texture_infos(self, index: int | None) -> list[dict[str, Any]]:
+    def _texture_infos(self, index: int | None) -> dict[str, dict[str, Any]]:
+        """What a material says of its textures, by the name of ours."""
         if index is None:
-            return []
+            return {}
         m = self.document.items("materials")[index]
         pbr = m.get("pbrMetallicRoughness", {})
-        infos = [pbr.get("baseColorTexture"), pbr.get("metallicRoughnessTexture"), m.get("normalTexture")]
-        return [i for i in infos if i is not None]
+        infos = {
+            "base_color_texture": pbr.get("baseColorTexture"),
+            "orm_texture": pbr.get("metallicRoughnessTexture"),
+            "normal_texture": m.get("normalTexture"),
+        }
+        return {name: info for name, info in infos.items() if info is not None}
 
-    def _transformed(self, uvs: NDArray, material: int | None) -> NDArray[np.float32]:
-        """KHR_texture_transform, when all textures of the material share it."""
-        found = [i.get("extensions", {}).get("KHR_texture_transform") for i in self._texture_infos(material)]
-        if not any(found):
-            return uvs
-        if any(f != found[0] for f in found):
-            self._note("textures of one material differ in KHR_texture_transform: the first one is used for all")
-        t = next(f for f in found if f)
-        angle = t.get("rotation", 0.0)
-        u, v = (uvs * np.array(t.get("scale", (1, 1)))).T
-        c, s = np.cos(angle), np.sin(angle)
-        return (np.stack([c * u + s * v, -s * u + c * v], 1) + np.array(t.get("offset", (0, 0)))).astype(np.float32)
+    def _in_one_frame(self, meshes: list[Mesh]) -> list[Mesh]:
+        """KHR_texture_transform applied, and textures brought under one transform and wrap mode where they differ."""
+        out = list(meshes)
+        for index, material in self._materials.items():
+            own = [k for k, m in enumerate(meshes) if m.material is material and m.uvs is not None]
+            infos = self._texture_infos(index)
+            textures = {n: t for n in infos if (t := getattr(material, n)) is not None}
+            if not own or not textures:
+                continue
+            uvs = [np.asarray(meshes[k].uvs) for k in own]
+            extensions = {n: infos[n].get("extensions", {}) for n in textures}
+            frames = {n: uv_frames.affine(e.get("KHR_texture_transform")) for n, e in extensions.items()}
+            new = material
+            placed = [uv_frames.apply(next(iter(frames.values())), uv).astype(np.float32) for uv in uvs]
+            if not uv_frames.alike(uvs, textures, frames):
+                # tangents follow the coordinates, and the normal map follows the tangents
+                leading = "normal_texture" if "normal_texture" in textures else next(iter(textures))
+                unified = uv_frames.in_one_frame(uvs, textures, frames, leading)
+                differ = f"material '{material.name}': its textures differ in transform or wrap mode"
+                if unified is None:
+                    self._note(f"{differ}, and are too large to be resampled: the first one's are used for all")
+                else:
+                    self._note(f"{differ}: resampled to common texture coordinates")
+                    placed, new = unified[0], replace(material, **unified[1])  # type: ignore[arg-type]
+            for k, uv in zip(own, placed, strict=True):
+                out[k] = replace(meshes[k], uvs=uv, material=new)
+        return out
 
     def _material(self, index: int | None) -> tuple[Material, int]:
         """(material, index of the texture coordinates that its textures use)."""
         infos = self._texture_infos(index)
         channels = [
             i.get("extensions", {}).get("KHR_texture_transform", {}).get("texCoord", i.get("texCoord", 0))
-            for i in infos
+            for i in infos.values()
         ]
         if len(set(channels)) > 1:
             self._note("textures of one material use different texture coordinates: the first set is used for all")
