@@ -1,0 +1,153 @@
+"""What is simplified: assets in the frame of a fit, their held-out views, and their starts, made once and kept."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from appearance_opt.asset import load, save
+from appearance_opt.config import as_dict, simplify_options
+from appearance_opt.evaluate.metrics import compare_images
+from appearance_opt.initial.atlas import unwrap
+from appearance_opt.initial.sphere import random_maps, sphere
+from appearance_opt.jobs import growth
+from appearance_opt.jobs.compare import render_asset
+from appearance_opt.jobs.displaced import gutter
+from appearance_opt.jobs.simplify import in_frame, support
+from appearance_opt.jobs.start import TIGHT_TRIANGLES, Start, budget, make_start, transferred
+from appearance_opt.reference.mesh import MeshReference
+from appearance_opt.views import ViewSampler, framing
+from scenes.build import build
+
+if TYPE_CHECKING:
+    from appearance_opt.asset.types import Asset
+    from appearance_opt.evaluate.metrics import Metrics
+    from appearance_opt.fit.model import Model
+
+ROOT = Path(__file__).resolve().parents[2]
+OUT = ROOT / "out" / "speed_vs_error"
+REFERENCES = ROOT.parent / "shared" / "judge" / "references"
+
+MEASURED_STREAM = 6
+"""Stream of random views that no part of a job draws from."""
+
+VIEWS, RESOLUTION, SAMPLES = 8, 256, 9
+
+
+@dataclass(frozen=True)
+class Subject:
+    """One asset and how it is simplified: ``ratio`` of its triangles, or ``triangles`` from a sphere."""
+
+    name: str
+    source: str
+    ratio: float | None = None
+    triangles: int | None = None
+
+    @property
+    def grown(self) -> bool:
+        """Does it start from a sphere?"""
+        return self.triangles is not None
+
+    @property
+    def arguments(self) -> list[str]:
+        """The same for the command line."""
+        if self.triangles is not None:
+            return ["--init", "sphere", "--triangles", str(self.triangles)]
+        return ["--ratio", str(self.ratio)]
+
+    def path(self) -> Path:
+        """The file; the embedded scene is written when first asked for. FileNotFoundError where an asset is not
+        there."""
+        if self.source != "relic":
+            path = REFERENCES / self.source
+            if not path.is_file():
+                raise FileNotFoundError(path)
+            return path
+        path = OUT / "relic.glb"
+        if not path.is_file():
+            OUT.mkdir(parents=True, exist_ok=True)
+            save(build("relic"), path)
+        return path
+
+
+SUBJECTS = (
+    Subject("spot, from a sphere", "spot.glb", triangles=3000),
+    Subject("flight_helmet", "flight_helmet.glb", ratio=0.015),
+    Subject("chess_king", "chess_king.glb", ratio=0.015),
+    Subject("demo scene", "relic", ratio=0.02),
+)
+"""``demo scene``: as in ``make demo``."""
+
+
+class Bench:
+    """A subject ready to be fitted and measured."""
+
+    def __init__(self, subject: Subject) -> None:
+        self.subject, self._path = subject, subject.path()
+        asset = load(self._path)
+        self.frame = framing(np.concatenate([m.positions for m in asset.meshes]))
+        self.asset = in_frame(asset, *self.frame)
+        self.reference = MeshReference(self.asset)
+        hull = support(self.reference.merged.positions)
+        self.sampler = ViewSampler((0.0, 0.0, 0.0), 1.0, 0, hull=hull)
+        self._views = self.sampler.held_out(MEASURED_STREAM).draw(0, VIEWS)
+        self._starts: dict[int, Start] = {}
+
+    @cached_property
+    def images(self) -> np.ndarray:
+        """The reference in the held-out views."""
+        return self.reference.render(self._views, RESOLUTION, SAMPLES)
+
+    def start(self, texture: int) -> Start:
+        """The start with an atlas of ``texture`` texels: a sphere with random maps as it is grown, or the decimated
+        mesh of the preset ``default`` with maps transferred in closed form."""
+        if texture not in self._starts:
+            self._starts[texture] = self._sphere(texture) if self.subject.grown else self._decimated(texture)
+        return self._starts[texture]
+
+    def measure(self, model: Model) -> Metrics:
+        """A model in the held-out views."""
+        return compare_images(self.images, self._camera.render(model))
+
+    def measure_asset(self, asset: Asset) -> Metrics:
+        """The same for a result as it was written, in the units of the source."""
+        return compare_images(self.images, render_asset(in_frame(asset, *self.frame), self._views, RESOLUTION, SAMPLES))
+
+    @cached_property
+    def _camera(self):
+        from appearance_opt.fit.validation import Validation
+
+        return Validation(self.reference, self._views, RESOLUTION, SAMPLES)
+
+    def _sphere(self, texture: int) -> Start:
+        assert self.subject.triangles is not None
+        count = growth.OVERSAMPLING * self.subject.triangles
+        mesh = sphere(count, self.sampler.centre, 0.6 * self.sampler.radius, texture)
+        return Start(mesh, {**random_maps(texture, 0, True)}, False, np.zeros((texture, texture), bool))
+
+    def _decimated(self, texture: int) -> Start:
+        # a number of steps instead of a budget: a slow machine must not drop rounds of reallocation
+        options = simplify_options("default", ratio=self.subject.ratio, steps=0)
+        first = options.texture_size
+
+        def make() -> tuple[Start, bool]:
+            if texture == first:
+                count = budget(options, self.asset.triangle_count)
+                return make_start(self.reference, options, self.sampler, count), False
+            mesh = self.start(first).mesh  # the same triangles in another atlas
+            other = simplify_options("default", ratio=self.subject.ratio, steps=0, texture_size=texture)
+            tight = len(mesh.faces) <= TIGHT_TRIANGLES
+            atlas = unwrap(mesh.positions, mesh.faces, texture, gutter(len(mesh.faces), other), tight)
+            return transferred(self.reference, atlas, other), False
+
+        key = hashlib.sha256(json.dumps(as_dict(options), sort_keys=True).encode() + self._path.read_bytes())
+        folder = OUT / "starts"
+        folder.mkdir(parents=True, exist_ok=True)
+        path = folder / f"{self._path.stem}_{texture}.npz"
+        return growth.kept(path, key.hexdigest(), make)[0]
