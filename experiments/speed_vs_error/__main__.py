@@ -12,6 +12,7 @@ the pictures and puts tables and numbers into docs/. Scenes other than the embed
 from __future__ import annotations
 
 import argparse
+import logging
 import os
 import platform
 import sys
@@ -34,13 +35,13 @@ def main() -> None:
     if a.write_docs:
         write_docs(a.seconds)
         return
-    for subject in _chosen(SUBJECTS, a.scenes):
-        try:
-            subject.path()
-        except FileNotFoundError as missing:
-            print(f"{subject.name}: {missing} is not there, left out", flush=True)
-            continue
-        run_subject(subject, _levers(a.levers), a.seconds, a.jobs)
+    # told of every fit that is stopped to be gone on with at another resolution
+    logging.getLogger("appearance_opt.fit.loop").addFilter(lambda record: "interrupted" not in record.msg)
+    subjects, levers = [s for s in _chosen(SUBJECTS, a.scenes) if _is_there(s)], _levers(a.levers)
+    for subject in subjects:
+        run_levers(subject, levers, a.seconds)
+    for subject in subjects:
+        run_jobs(subject, a.jobs)
 
 
 def _arguments() -> argparse.Namespace:
@@ -75,47 +76,65 @@ def _levers(text: str) -> list[Lever]:
     return [lever for lever in LEVERS if lever.name in wanted]
 
 
-def run_subject(subject: Subject, levers: list[Lever], seconds: float, jobs: str) -> None:
-    """All rows of a scene that are asked for and not there."""
-    rows, whole = read(CURVES, CurveRow), read(WHOLE, JobRow)
-    done = {(r.scene, r.lever, r.budget) for r in rows}
-    levers = [lever for lever in levers if (subject.name, lever.name, seconds) not in done]
-    ran = {(r.scene, r.job) for r in whole}
-    todo = [j for j in JOBS.get(subject.name, ()) if (subject.name, j.name) not in ran]
-    if jobs != "all":
-        todo = [j for j in todo if j.name in _names(jobs)]
-    if not levers and not todo:
-        print(f"{subject.name}: nothing to do", flush=True)
-        return
-    from appearance_opt import backend
+def _is_there(subject: Subject) -> bool:
+    try:
+        subject.path()
+    except FileNotFoundError as missing:
+        print(f"{subject.name}: {missing} is not there, left out", flush=True)
+        return False
+    return True
 
-    backend.select("cpu")
+
+def run_levers(subject: Subject, levers: list[Lever], seconds: float) -> None:
+    """All fits of a scene that are asked for and not there."""
+    rows = read(CURVES, CurveRow)
+    done = {(r.scene, r.lever, r.budget) for r in rows}
+    todo = [lever for lever in levers if (subject.name, lever.name, seconds) not in done]
+    if not todo:
+        return
     began = time.perf_counter()
-    bench = Bench(subject)
+    bench = _bench(subject)
     setup = default_setup(subject.grown, len(bench.start(256).mesh.faces) if subject.grown else 0)
-    print(f"{subject.name}: {len(levers)} fits of {seconds:g} s, {len(todo)} whole jobs", flush=True)
-    for lever in levers:
+    print(f"{subject.name}: at most {len(todo)} fits of {seconds:g} s", flush=True)
+    for lever in todo:
         changed = lever.change(setup)
         if changed is None:
             continue
         rows += run_lever(bench, lever, changed, seconds)
         write(CURVES, rows, CurveRow)
-        own = tables.curve(rows, subject.name, lever.name)
-        found = tables.against_default([r for r in rows if r.budget == seconds], subject.name, lever.name)
-        against = "" if found is None else f", {found[0]:+.2f} dB, FLIP x {found[1]:.3f}"
+        fits = [r for r in rows if r.budget == seconds]
+        end = tables.curve(fits, subject.name, lever.name)[-1]
+        found = tables.against_default(fits, subject.name, lever.name)
+        against = "" if found is None else f", {found[0]:+.2f} dB, FLIP x {found[1]:.3f} against the default"
         print(
-            f"  [{time.perf_counter() - began:5.0f} s] {lever.name}: {own[-1].step} steps, "
-            f"{own[-1].psnr_covered:.2f} dB{against}",
+            f"  [{time.perf_counter() - began:4.0f} s] {lever.name}: {end.step} steps, {end.psnr_covered:.2f} dB"
+            f"{against}",
             flush=True,
         )
+
+
+def run_jobs(subject: Subject, names: str) -> None:
+    """All whole jobs of a scene that are asked for and not there."""
+    rows = read(WHOLE, JobRow)
+    done = {(r.scene, r.job) for r in rows}
+    jobs = [j for j in JOBS.get(subject.name, ()) if names == "all" or j.name in _names(names)]
+    todo = [j for j in jobs if (subject.name, j.name) not in done]
+    if not todo:
+        return
+    bench = _bench(subject)
+    print(f"{subject.name}: {len(todo)} whole jobs, {sum(j.seconds for j in todo):.0f} s and more", flush=True)
     for job in todo:
-        whole.append(run_job(bench, job))
-        write(WHOLE, whole, JobRow)
-        print(
-            f"  [{time.perf_counter() - began:5.0f} s] job {job.name}: {whole[-1].seconds:.1f} s, "
-            f"{whole[-1].psnr_covered:.2f} dB, FLIP {whole[-1].flip:.4f}",
-            flush=True,
-        )
+        rows.append(run_job(bench, job))
+        write(WHOLE, rows, JobRow)
+        last = rows[-1]
+        print(f"  {job.name}: {last.seconds:.1f} s, {last.psnr_covered:.2f} dB, FLIP {last.flip:.4f}", flush=True)
+
+
+def _bench(subject: Subject) -> Bench:
+    from appearance_opt import backend
+
+    backend.select("cpu")
+    return Bench(subject)
 
 
 def run_lever(bench: Bench, lever: Lever, setup: Setup, seconds: float) -> list[CurveRow]:
@@ -136,24 +155,31 @@ def run_lever(bench: Bench, lever: Lever, setup: Setup, seconds: float) -> list[
 
 def write_docs(seconds: float) -> None:
     """Pictures, tables and CSV into docs/, from the rows of fits of ``seconds``."""
+    from appearance_opt import backend
+
     order = {s.name: k for k, s in enumerate(SUBJECTS)}
     place = {name: k for k, name in enumerate(GROUPS)}
     curves = [r for r in read(CURVES, CurveRow) if r.budget == seconds]
     curves.sort(key=lambda r: (order[r.scene], place[r.lever], r.seconds))
     jobs = sorted(read(WHOLE, JobRow), key=lambda r: (order[r.scene], r.seconds))
-    if not curves and not jobs:
-        sys.exit(f"no rows of {seconds:g} s in {OUT}: run the experiment first")
-    for path in plots.draw(curves, jobs, IMAGES):
-        print(path.relative_to(ROOT))
+    if not any(r.lever == DEFAULT for r in curves):
+        sys.exit(f"no fit of {seconds:g} s with default settings in {CURVES}: run the experiment first")
+    machine = f"{os.cpu_count()} cores of an {_processor()}, LLVM {backend.select('cpu').llvm}; fits of {seconds:g} s."
+    sections = {"machine": f"Machine: {machine}", "levers": "", "jobs": ""}
+    IMAGES.mkdir(parents=True, exist_ok=True)
+    sections["levers"] = _section(plots.draw_levers(curves, IMAGES), tables.lever_table(curves))
     write(IMAGES / "speed_vs_error_curves.csv", curves, CurveRow)
-    write(IMAGES / "speed_vs_error_jobs.csv", jobs, JobRow)
-    sections = {
-        "machine": f"{os.cpu_count()} cores, {_processor()}; fits of {seconds:g} s.",
-        "levers": tables.lever_table(curves),
-        "jobs": tables.job_table(jobs),
-    }
+    if jobs:
+        sections["jobs"] = _section(plots.draw_jobs(jobs, IMAGES), tables.job_table(jobs))
+        write(IMAGES / "speed_vs_error_jobs.csv", jobs, JobRow)
     tables.insert(DOCUMENT, sections)
     print(DOCUMENT.relative_to(ROOT))
+
+
+def _section(pictures: dict[str, Path], table: str) -> str:
+    """The first picture, the table, the other pictures."""
+    images = [f"![{title}]({path.relative_to(DOCUMENT.parent).as_posix()})" for title, path in pictures.items()]
+    return "\n\n".join([images[0], table, *images[1:]])
 
 
 def _processor() -> str:

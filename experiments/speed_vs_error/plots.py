@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import matplotlib
 import numpy as np
 
-from experiments.speed_vs_error.setups import DEFAULT
+from experiments.speed_vs_error.setups import DEFAULT, SEED
 from experiments.speed_vs_error.tables import against_default, curve, levers_of, pareto, scenes_of
 
 if TYPE_CHECKING:
@@ -18,25 +18,28 @@ COLOURS = ("#c0392b", "#2c6fbb", "#5a9e6f", "#e08e0b", "#8e5ea2", "#17a2b8")
 PRESET_COLOURS = {"draft": "#5a9e6f", "default": "#2c6fbb", "final": "#c0392b"}
 
 
-def draw(curves: list[CurveRow], jobs: list[JobRow], folder: Path) -> list[Path]:
-    """All pictures that the rows allow, into ``folder``."""
+def draw_levers(curves: list[CurveRow], folder: Path) -> dict[str, Path]:
+    """Pictures of the levers in ``folder``: title -> file."""
     matplotlib.use("agg")
-    folder.mkdir(parents=True, exist_ok=True)
-    out = []
-    if any(r.lever == DEFAULT for r in curves):
-        groups = levers_of(curves)
-        names = list(groups)
-        half = -(-len(names) // 2)
-        for k, part in enumerate((names[:half], names[half:]), start=1):
-            if part:
-                out.append(folder / f"speed_vs_error_curves{k}.png")
-                _curves(curves, {n: groups[n] for n in part}, out[-1])
-        out.append(folder / "speed_vs_error_levers.png")
-        _levers(curves, out[-1])
-    if jobs:
-        out.append(folder / "speed_vs_error_jobs.png")
-        _jobs(jobs, out[-1])
+    groups = levers_of(curves)
+    out = {"Levers against the default after equal time": folder / "speed_vs_error_levers.png"}
+    _levers(curves, *out.values())
+    names = list(groups)
+    half = -(-len(names) // 2)
+    for number, part in enumerate((names[:half], names[half:]), start=1):
+        path = folder / f"speed_vs_error_curves{number}.png"
+        if part:
+            out[f"PSNR against seconds of fitting: {', '.join(part)}"] = path
+            _curves(curves, {n: groups[n] for n in part}, path)
     return out
+
+
+def draw_jobs(jobs: list[JobRow], folder: Path) -> dict[str, Path]:
+    """Picture of the whole jobs in ``folder``: title -> file."""
+    matplotlib.use("agg")
+    path = folder / "speed_vs_error_jobs.png"
+    _jobs(jobs, path)
+    return {"PSNR and FLIP of whole jobs against wall-clock time": path}
 
 
 def _curves(rows: list[CurveRow], groups: dict[str, list[str]], path: Path) -> None:
@@ -58,7 +61,8 @@ def _curves(rows: list[CurveRow], groups: dict[str, list[str]], path: Path) -> N
 
 
 def _panel(axis, rows: list[CurveRow], scene: str, levers: list[str]) -> None:
-    """One scene, one group. The time axis is logarithmic, and begins with the first look at the running fit."""
+    """One scene, one group. The time axis is logarithmic, and begins with the first
+    look at the running fit; the default's start is dotted."""
     values = []
     for lever, colour in zip((*levers, DEFAULT), (*COLOURS[: len(levers)], "black"), strict=True):
         own = [r for r in curve(rows, scene, lever) if r.seconds > 0]
@@ -68,14 +72,14 @@ def _panel(axis, rows: list[CurveRow], scene: str, levers: list[str]) -> None:
         values += y
         axis.plot(x, y, color=colour, label=lever, marker="o", markersize=2.5, linewidth=1.8 if lever == DEFAULT else 1)
     if values:
+        for first in curve(rows, scene, DEFAULT)[:1]:
+            axis.axhline(first.psnr_covered, color="black", linewidth=0.8, linestyle=":", label="start")
         # a lever that fails by many dB must not flatten all others
         low = max(min(values), np.percentile(values, 75) - 8.0)
         axis.set_ylim(low - 0.3, max(values) + 0.3)
-        axis.set_xscale("log", base=2)
-        axis.xaxis.set_major_formatter(matplotlib.ticker.FormatStrFormatter("%g"))
-        axis.legend(fontsize=6, loc="lower right")
+        _seconds_axis(axis)
+        axis.legend(fontsize=6, loc="best")
     axis.grid(alpha=0.25, linewidth=0.4)
-    axis.tick_params(labelsize=7)
 
 
 def _levers(rows: list[CurveRow], path: Path) -> None:
@@ -94,6 +98,8 @@ def _levers(rows: list[CurveRow], path: Path) -> None:
         axes[0].scatter(np.maximum(decibel, -LARGEST), y + shift, s=14, color=colour, label=scene)
         axes[1].scatter(np.minimum(ratio, 2.0), y + shift, s=14, color=colour)
     axes[0].set_xlim(-LARGEST - 0.1, None)
+    noise = max((abs(f[0]) for f in (against_default(rows, s, SEED) for s in scenes) if f is not None), default=0.0)
+    axes[0].axvspan(-noise, noise, color="#eeeeee", zorder=0)
     for axis, zero in zip(axes, (0.0, 1.0), strict=True):
         axis.axvline(zero, color="black", linewidth=0.8)
         axis.grid(alpha=0.25, linewidth=0.4)
@@ -111,7 +117,8 @@ LARGEST = 2.0
 
 
 def _jobs(rows: list[JobRow], path: Path) -> None:
-    """PSNR and FLIP against wall time of whole jobs: a column per scene, the Pareto front as a line."""
+    """PSNR and FLIP against wall time of whole jobs: a column per scene, a line per preset, a star at its own
+    budget; the Pareto front in grey."""
     import matplotlib.pyplot as plt
 
     scenes = scenes_of(rows)
@@ -121,26 +128,35 @@ def _jobs(rows: list[JobRow], path: Path) -> None:
         front = pareto(own)
         for axis, name in zip(column, ("psnr_covered", "flip"), strict=True):
             best = [r for r in own if r.job in front]
-            axis.plot([r.seconds for r in best], [getattr(r, name) for r in best], color="#bbbbbb", zorder=0)
-            for r in own:
-                preset = r.job == r.preset
+            x, y = [r.seconds for r in best], [getattr(r, name) for r in best]
+            axis.plot(x, y, color="#dddddd", linewidth=6, zorder=0, label="Pareto front (PSNR)")
+            for preset, colour in PRESET_COLOURS.items():
+                line = [r for r in own if r.preset == preset]
+                x, y = [r.seconds for r in line], [getattr(r, name) for r in line]
+                axis.plot(x, y, color=colour, marker="o", markersize=4, linewidth=1, label=preset)
+                star = [r for r in line if r.job == preset]
                 axis.scatter(
-                    r.seconds, getattr(r, name), color=PRESET_COLOURS[r.preset], marker="*" if preset else "o",
-                    s=130 if preset else 22,
-                )  # fmt: skip
-                axis.annotate(
-                    r.job, (r.seconds, getattr(r, name)), fontsize=6, xytext=(4, -9), textcoords="offset points"
+                    [r.seconds for r in star], [getattr(r, name) for r in star], s=150, marker="*", color=colour
                 )
-            axis.set_xscale("log")
-            axis.xaxis.set_major_formatter(matplotlib.ticker.FormatStrFormatter("%g"))
-            axis.xaxis.set_minor_formatter(matplotlib.ticker.FormatStrFormatter("%g"))
-            axis.grid(alpha=0.25, which="both", linewidth=0.4)
-            axis.tick_params(labelsize=7, which="both")
+            _seconds_axis(axis)
+            axis.grid(alpha=0.25, linewidth=0.4)
         column[0].set_title(scene, fontsize=9)
-        column[1].set_xlabel("seconds from the command to its end", fontsize=8)
+        column[0].legend(fontsize=7, loc="lower right")
+        column[1].set_xlabel("seconds from the command to its end (star: the preset's own budget)", fontsize=7)
     axes[0, 0].set_ylabel("PSNR, covered (dB)", fontsize=8)
     axes[1, 0].set_ylabel("FLIP", fontsize=8)
     _save(figure, path)
+
+
+def _seconds_axis(axis) -> None:
+    """Logarithmic, with round numbers."""
+    from matplotlib import ticker
+
+    axis.set_xscale("log")
+    axis.xaxis.set_major_locator(ticker.FixedLocator([0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500]))
+    axis.xaxis.set_minor_locator(ticker.NullLocator())
+    axis.xaxis.set_major_formatter(ticker.FormatStrFormatter("%g"))
+    axis.tick_params(labelsize=7)
 
 
 def _save(figure, path: Path) -> None:

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from experiments.speed_vs_error.subjects import Bench
 
 PARTS = frozenset(("shape", "normal", "material"))
-FRACTIONS = (1 / 16, 1 / 8, 1 / 4, 1 / 2, 3 / 4)
+FRACTIONS = (1 / 16, 1 / 8, 1 / 4, 1 / 2)
 """Parts of the time at which a fit is looked at, besides its start and its end."""
 
 WARM_UP_STEPS = 12
@@ -59,21 +59,22 @@ def run(bench: Bench, setup: Setup, seconds: float) -> Run:
             patches.enter_context(mock.patch("appearance_opt.latent.texels.MAX_LEVELS", 1))
         if not setup.laplacian_decays:
             patches.enter_context(mock.patch("appearance_opt.fit.loop.laplacian_weight", lambda first, _: first))
-        return Run(bench, start, _timed(bench, start, setup, seconds))
+        return Run(bench, start, _timed(bench, start, setup, seconds), (setup.texture, setup.closed_form))
 
 
 @dataclass(frozen=True)
 class Run:
-    """A fit that is over, not yet measured."""
+    """A fit that is over, not yet measured. ``which``: the start among those of the scene."""
 
     bench: Bench
     start: Start
     snapshots: list[Snapshot]
+    which: tuple[int, bool]
 
     def measured(self, averaged: bool = True) -> list[Point]:
         """The start and every snapshot: the running means of the parameters, or their last values."""
         model = Model(self.start.mesh, self.start.maps, PARTS, Rates())
-        points = [Point(0.0, 0, self.bench.measure(model))]
+        points = [Point(0.0, 0, self.bench.measure_start(self.which, model))]
         for s in self.snapshots:
             model.restore(s.means if averaged else s.values)
             points.append(Point(s.seconds, s.step, self.bench.measure(model)))

@@ -71,8 +71,9 @@ class Lever:
     core: bool = True
 
 
-DEFAULT, UNAVERAGED = "default", "no averaging"
-"""The second is no fit of its own: the last parameters of the default's fit rather than their running mean."""
+DEFAULT, SEED, UNAVERAGED = "default", "another seed", "no averaging"
+"""The second tells what chance does. The third is no fit of its own: the last parameters of the default's fit rather
+than their running mean."""
 
 
 def _resolution(factor: float) -> Callable[[Setup], Setup]:
@@ -124,7 +125,7 @@ FIRST_LAPLACIAN = simplify_options("default", ratio=1.0).laplacian
 
 LEVERS = (
     Lever(DEFAULT, "noise and averaging", lambda s: s),
-    Lever("another seed", "noise and averaging", lambda s: replace(s, seed=1)),
+    Lever(SEED, "noise and averaging", lambda s: replace(s, seed=1)),
     Lever("resolution x 1/2", "resolution", _resolution(0.5)),
     Lever("resolution x 3/4", "resolution", _resolution(0.75), core=False),
     Lever("resolution x 3/2", "resolution", _resolution(1.5)),
@@ -160,7 +161,7 @@ LEVERS = (
     Lever("texture x 1/2", "texture size", _texture(0.5)),
     Lever("texture x 2", "texture size", _texture(2.0)),
     Lever("loss l1", "loss", _loss("l1")),
-    Lever("loss log-srgb-l2", "loss", _loss("log-srgb-l2")),
+    Lever("loss log-srgb-l2", "loss", _loss("log-srgb-l2"), core=False),
     Lever("loss l2", "loss", _loss("l2"), core=False),
     Lever("loss smape", "loss", _loss("smape"), core=False),
     Lever("loss relative-l2", "loss", _loss("relative-l2"), core=False),

@@ -98,6 +98,7 @@ class Bench:
         self.sampler = ViewSampler((0.0, 0.0, 0.0), 1.0, 0, hull=hull)
         self._views = self.sampler.held_out(MEASURED_STREAM).draw(0, VIEWS)
         self._starts: dict[int, Start] = {}
+        self._measured: dict[tuple[int, bool], Metrics] = {}
 
     @cached_property
     def images(self) -> np.ndarray:
@@ -114,6 +115,12 @@ class Bench:
     def measure(self, model: Model) -> Metrics:
         """A model in the held-out views."""
         return compare_images(self.images, self._camera.render(model))
+
+    def measure_start(self, which: tuple[int, bool], model: Model) -> Metrics:
+        """The same for a start, once for each of those that ``which`` tells apart."""
+        if which not in self._measured:
+            self._measured[which] = self.measure(model)
+        return self._measured[which]
 
     def measure_asset(self, asset: Asset) -> Metrics:
         """The same for a result as it was written, in the units of the source."""
