@@ -92,6 +92,8 @@ def run_levers(subject: Subject, levers: list[Lever], seconds: float) -> None:
     todo = [lever for lever in levers if (subject.name, lever.name, seconds) not in done]
     if not todo:
         return
+    import drjit as dr
+
     began = time.perf_counter()
     bench = _bench(subject)
     setup = default_setup(subject.grown, len(bench.start(256).mesh.faces) if subject.grown else 0)
@@ -101,6 +103,7 @@ def run_levers(subject: Subject, levers: list[Lever], seconds: float) -> None:
         if changed is None:
             continue
         rows += run_lever(bench, lever, changed, seconds)
+        dr.flush_malloc_cache()  # what 2048² textures took is not to be carried along
         write(CURVES, rows, CurveRow)
         fits = [r for r in rows if r.budget == seconds]
         end = tables.curve(fits, subject.name, lever.name)[-1]
