@@ -162,9 +162,10 @@ def write_docs(seconds: float) -> None:
 
     order = {s.name: k for k, s in enumerate(SUBJECTS)}
     place = {name: k for k, name in enumerate(GROUPS)}
-    curves = [r for r in read(CURVES, CurveRow) if r.budget == seconds]
+    # a lever or a scene that is there no more says nothing of the present code
+    curves = [r for r in read(CURVES, CurveRow) if r.budget == seconds and r.lever in place and r.scene in order]
     curves.sort(key=lambda r: (order[r.scene], place[r.lever], r.seconds))
-    jobs = sorted(read(WHOLE, JobRow), key=lambda r: (order[r.scene], r.seconds))
+    jobs = sorted((r for r in read(WHOLE, JobRow) if r.scene in order), key=lambda r: (order[r.scene], r.seconds))
     if not any(r.lever == DEFAULT for r in curves):
         sys.exit(f"no fit of {seconds:g} s with default settings in {CURVES}: run the experiment first")
     machine = f"{os.cpu_count()} cores of an {_processor()}, LLVM {backend.select('cpu').llvm}; fits of {seconds:g} s."
