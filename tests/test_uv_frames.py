@@ -120,8 +120,8 @@ def test_each_texture_keeps_its_transform_and_wrap_mode(tmp_path: Path, case: st
                 u, v = np.linalg.solve(to_new, centre - uvs[0]) + low
                 if low <= u <= high and low <= v <= high:
                     expected = lookup(pixels, wrap, transform, u, v)
-                    # rounding to 8 bits, and coordinates in single precision (measured 0.501)
-                    assert np.abs(new.pixels[row, column] - expected).max() < 0.52
+                    # rounding to 8 bits, and coordinates in single precision (measured 0.5003)
+                    assert np.abs(new.pixels[row, column] - expected).max() < 0.505
                     checked += 1
         assert checked > 100
 

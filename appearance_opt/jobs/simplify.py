@@ -142,6 +142,7 @@ class _Job:
         checkpointer: Checkpointer | None,
         with_report: bool,
     ) -> None:
+        from appearance_opt.jobs.fitting import seconds_left
         from appearance_opt.jobs.start import budget, loaded_start, make_start
         from appearance_opt.reference.mesh import MeshReference
         from appearance_opt.views import ViewSampler, framing
@@ -161,7 +162,8 @@ class _Job:
             self.start = self._grown(budget(options, asset.triangle_count))
         elif options.init in ("decimate", "sphere"):
             triangles = budget(options, asset.triangle_count)
-            self.start = make_start(self.reference, options, self.sampler, triangles)
+            left = seconds_left(options, watch, with_report)
+            self.start = make_start(self.reference, options, self.sampler, triangles, left)
         else:
             self.start = loaded_start(
                 Path(options.init), (np.array(self.frame[0]), self.frame[1]), self.reference, options

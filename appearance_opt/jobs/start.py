@@ -36,7 +36,7 @@ log = logging.getLogger(__name__)
 VISIBILITY_VIEWS = 160
 
 REALLOCATION_SHARE = 0.3
-"""Part of a time budget that moving triangles may take."""
+"""Part of the time left after the first start that moving triangles may take."""
 
 TIGHT_TRIANGLES = 10_000
 """Largest mesh whose atlas is packed by trying every place: the time grows with the square of the charts."""
@@ -74,8 +74,14 @@ def budget(options: SimplifyOptions, available: int) -> int:
     return count
 
 
-def make_start(reference: MeshReference, options: SimplifyOptions, sampler: ViewSampler, triangles: int) -> Start:
-    """Sphere, decimated reference, or the mesh of another file (in the reference's frame)."""
+def make_start(
+    reference: MeshReference,
+    options: SimplifyOptions,
+    sampler: ViewSampler,
+    triangles: int,
+    seconds: float | None = None,
+) -> Start:
+    """Sphere, or decimated reference. ``seconds``: what is left for start and fit (None: no limit)."""
     size = options.texture_size
     if options.init == "sphere":
         if triangles < SMALLEST_SPHERE:
@@ -107,7 +113,8 @@ def make_start(reference: MeshReference, options: SimplifyOptions, sampler: View
 
     began = time.perf_counter()
     start = decimated(weight)
-    rounds = affordable(options, time.perf_counter() - began)
+    taken = time.perf_counter() - began
+    rounds = affordable(options.reallocate, taken, None if seconds is None else seconds - taken)
     if not rounds:
         return start
     judge = StartError(reference, sampler.held_out(3))
@@ -118,12 +125,12 @@ def make_start(reference: MeshReference, options: SimplifyOptions, sampler: View
     return packed if judge.measure(packed.drawn, _images(packed))[0] < error else start
 
 
-def affordable(options: SimplifyOptions, seconds: float) -> int:
-    """Rounds of reallocation, of those asked for, that leave most of a time budget to the fit when one takes
-    ``seconds``."""
-    if options.budget is None or seconds <= 0:
-        return options.reallocate
-    return min(options.reallocate, int(REALLOCATION_SHARE * options.budget / seconds))
+def affordable(rounds: int, taken: float, left: float | None) -> int:
+    """Rounds of reallocation, of those asked for, that leave most of the time that is ``left`` to the fit when
+    one takes about as long as the first start has ``taken``. Both in seconds; None: no limit."""
+    if left is None or taken <= 0:
+        return rounds
+    return min(rounds, int(REALLOCATION_SHARE * max(left, 0.0) / taken))
 
 
 def _reallocated(
