@@ -1,6 +1,7 @@
-"""Closed-form bake against Blender's Cycles bake, and the fitted bake against the closed form.
+"""Closed-form bake against Blender's Cycles bake, and the fitted bakes against the closed form.
 
     python -m experiments.baking --blender BPY/bin/python [--rows chess_king,...] [--preset default] [--table]
+    python -m experiments.baking --joint [--rows chess_king,...]
 
 BPY is a virtual environment of its own, for Blender's package wants other versions than ours:
 
@@ -8,8 +9,10 @@ BPY is a virtual environment of its own, for Blender's package wants other versi
 
 Without --blender, its table stays empty. Pairs: each asset decimated to 2 to 5 % of its triangles and unwrapped,
 geometry alone; both bakers get the same two files. The judge is the renderer in ``../shared/judge``, which is not
-ours. Each stage that is on disk in ``out/baking`` is not run again (delete the folder to start over); ``--table``
-prints the tables for docs/baking.md from what is there. Times are of the bakes alone, ours with warm kernels.
+ours. --joint adds a bake whose shape is fitted, too, without any triangle more (``bake --joint --subdivision 0``),
+from the same two files. Each stage that is on disk in ``out/baking`` is not run again (delete the folder to start
+over); ``--table`` prints the tables for docs/baking.md from what is there. Times are of the bakes alone, ours with warm
+kernels.
 """
 
 from __future__ import annotations
@@ -25,28 +28,19 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from experiments.common import JUDGE, source_of
+from experiments.common import OUT as RESULTS
+
 if TYPE_CHECKING:
     from appearance_opt.asset.types import Mesh
 
-ROOT = Path(__file__).resolve().parents[2]
-JUDGE = ROOT.parent / "shared" / "judge"
-OUT = ROOT / "out" / "baking"
+OUT = RESULTS / "baking"
 ROWS = {"chess_king": 4864, "flight_helmet": 2820, "relic": 8182}
 SIZE = 1024
 CAGES = (1.0, 1 / 4, 1 / 16)
 """Blender's cages, in units of the reach of our rays."""
 
 METRICS = (("psnr_cov", 2), ("flip", 4), ("sil_shift_px", 3))
-
-
-def source_of(asset: str) -> Path:
-    """The heavy asset; the procedural scene is built when it is first asked for."""
-    if asset != "relic":
-        return JUDGE / "references" / f"{asset}.glb"
-    path = OUT / "relic.glb"
-    if not path.exists():
-        subprocess.run([sys.executable, "-m", "scenes.build", "relic", str(path)], check=True, cwd=ROOT)
-    return path
 
 
 def make_low(source: Path, triangles: int, path: Path) -> None:
@@ -83,6 +77,17 @@ def ours(source: Path, low: Path, stem: Path, preset: str, steps: int | None) ->
     }
 
 
+def with_shape(source: Path, low: Path, stem: Path, preset: str, steps: int | None) -> dict:
+    """The bake that moves LOW's vertices, too: the same triangles and texture coordinates."""
+    from appearance_opt import bake_options, save
+    from appearance_opt.jobs.joint import joint
+
+    options = bake_options(preset, joint=True, subdivision=(0,), texture_size=SIZE, steps=steps)
+    result = joint(source, low, None, options)
+    save(result.shown, f"{stem}_joint.glb")
+    return {"seconds": result.seconds["total"], "steps": result.fit.steps}
+
+
 def blender(python: str, source: Path, low: Path, stem: Path, reach: float) -> dict:
     """Blender's bake at the best of several cages: its cage takes the first surface from outside, so one that
     is wide enough for the whole mesh shows neighbouring parts. Best: nearest to ours in the mean."""
@@ -94,11 +99,20 @@ def blender(python: str, source: Path, low: Path, stem: Path, reach: float) -> d
             command = [python, str(script), str(source), str(low), str(folder), str(SIZE), str(share * reach), "4"]
             subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
         seconds = json.loads((folder / "seconds.json").read_text())
-        apart = angles(stem, np.load(folder / "normal.npy"))
+        apart = angles(Path(f"{stem}_closed.glb"), np.load(folder / "normal.npy"))
         tried[share] = {"cage": share * reach, "seconds": sum(seconds.values()), "seconds_by_map": seconds, **apart}
     best = min(tried, key=lambda share: tried[share]["angle_mean"])
     blender_asset(stem, Path(f"{stem}_blender_{best:g}"))
-    return {**tried[best], "tried": tried}
+    return {**tried[best], "tried": tried, "same_rule": same_rule(source, low, stem, best, reach)}
+
+
+def same_rule(source: Path, low: Path, stem: Path, share: float, reach: float) -> dict:
+    """Blender's normals against ours when our rays take Blender's surface: the outermost one of the same cage."""
+    from appearance_opt import bake, bake_options
+
+    options = bake_options(closed_form=True, texture_size=SIZE, hit="outermost", cage=share * reach)
+    bake(source, low, f"{stem}_outermost.glb", options)
+    return angles(Path(f"{stem}_outermost.glb"), np.load(f"{stem}_blender_{share:g}/normal.npy"))
 
 
 def blender_asset(stem: Path, folder: Path) -> None:
@@ -128,13 +142,13 @@ def maps_of_blender(mesh: Mesh, folder: Path) -> Mesh:
     return replace(mesh, material=material)
 
 
-def angles(stem: Path, theirs: np.ndarray) -> dict:
-    """Degrees between two normal maps over covered texels."""
+def angles(baked: Path, theirs: np.ndarray) -> dict:
+    """Degrees between the normal map of a file and another one, over covered texels."""
     from appearance_opt import load
     from appearance_opt.baking.low import prepare
     from appearance_opt.baking.points import texel_coverage
 
-    asset = load(f"{stem}_closed.glb")
+    asset = load(baked)
     covered = texel_coverage(prepare(asset).mesh, SIZE)
     texture = asset.meshes[0].material.normal_texture
     assert texture is not None
@@ -164,7 +178,7 @@ def judge(source: Path, candidates: dict[str, str], stem: Path, views: int) -> d
     return dict(zip(candidates, json.loads(scores.read_text())["candidates"], strict=True))
 
 
-def run_row(asset: str, preset: str, steps: int | None, python: str | None, views: int) -> dict:
+def run_row(asset: str, preset: str, steps: int | None, python: str | None, views: int, free: bool) -> dict:
     """One asset, all stages."""
     from appearance_opt import backend
 
@@ -184,8 +198,12 @@ def run_row(asset: str, preset: str, steps: int | None, python: str | None, view
         row["blender"] = blender(python, source, low, stem, row["ours"]["reach"])
         row.pop("scores", None)
         path.write_text(json.dumps(row, indent=1))
+    if free and row.get("joint", {}).get("asked") != [preset, steps]:
+        row["joint"] = {"asked": [preset, steps], **with_shape(source, low, stem, preset, steps)}
+        row.pop("scores", None)
+        path.write_text(json.dumps(row, indent=1))
     if "scores" not in row:
-        names = ["closed", "fitted"] + (["blender"] if "blender" in row else [])
+        names = ["closed", "fitted", *(n for n in ("blender", "joint") if n in row)]
         row["scores"] = judge(source, {n: f"{stem}_{n}.glb" for n in names}, stem, views)
         path.write_text(json.dumps(row, indent=1))
     return row
@@ -198,8 +216,9 @@ def cell(scores: dict) -> str:
 def tables(rows: list[dict]) -> str:
     """Markdown."""
     lines = [
-        "| asset, triangles | Blender | closed form | degrees apart: mean, median, mean < 20, share > 20 | times |",
-        "|---|---|---|---|---|",
+        "| asset, triangles | Blender | closed form | degrees apart: mean, median, mean < 20, share > 20 "
+        "| degrees, same rule: mean, median | times |",
+        "|---|---|---|---|---|---|",
     ]
     for r in rows:
         name = f"{r['asset']}, {r['triangles']}"
@@ -208,20 +227,26 @@ def tables(rows: list[dict]) -> str:
         b = r["blender"]
         degrees = ", ".join(f"{b[k]:.2f}" for k in ("angle_mean", "angle_50", "angle_mean_same"))
         degrees += f", {100 * b['other_surface']:.1f} %"
+        same = ", ".join(f"{b['same_rule'][k]:.2f}" for k in ("angle_mean", "angle_50"))
         ratio = b["seconds"] / r["ours"]["seconds_warm"]["closed form"]
         lines.append(
-            f"| {name} | {cell(r['scores']['blender'])} | {cell(r['scores']['closed'])} | {degrees} | {ratio:.1f} |"
+            f"| {name} | {cell(r['scores']['blender'])} | {cell(r['scores']['closed'])} | {degrees} | {same} | "
+            f"{ratio:.1f} |"
         )
     lines += [
         "",
-        "| asset, triangles | closed form | fitted | gain (dB) | FLIP ratio | steps |",
-        "|---|---|---|---|---|---|",
+        "| asset, triangles | closed form | fitted, shape kept | shape fitted, too | gain (dB) | FLIP ratio | steps |",
+        "|---|---|---|---|---|---|---|",
     ]
     for r in rows:
-        c, f = r["scores"]["closed"], r["scores"]["fitted"]
+        c = r["scores"]["closed"]
+        fits = [r["scores"][n] for n in ("fitted", "joint") if n in r["scores"]]
+        cells = [cell(f) for f in fits] + ["not run"] * (2 - len(fits))
+        gains = ", ".join(f"{f['psnr_cov'] - c['psnr_cov']:+.2f}" for f in fits)
+        flips = ", ".join(f"{f['flip'] / c['flip']:.2f}" for f in fits)
+        steps = ", ".join(str(n) for n in (r["ours"]["fit_steps"], r.get("joint", {}).get("steps")) if n is not None)
         lines.append(
-            f"| {r['asset']}, {r['triangles']} | {cell(c)} | {cell(f)} | {f['psnr_cov'] - c['psnr_cov']:+.2f} | "
-            f"{f['flip'] / c['flip']:.2f} | {r['ours']['fit_steps']} |"
+            f"| {r['asset']}, {r['triangles']} | {cell(c)} | {' | '.join(cells)} | {gains} | {flips} | {steps} |"
         )
     return "\n".join(lines)
 
@@ -233,6 +258,7 @@ def main() -> None:
     parser.add_argument("--preset", default="default")
     parser.add_argument("--steps", type=int, default=None, help="instead of the preset's time")
     parser.add_argument("--views", type=int, default=24)
+    parser.add_argument("--joint", action="store_true", help="also fit the shape")
     parser.add_argument("--table", action="store_true")
     a = parser.parse_args()
     names = [n for n in a.rows.split(",") if n]
@@ -242,7 +268,7 @@ def main() -> None:
         return
     if not JUDGE.exists():
         sys.exit(f"{JUDGE} is not there: this experiment needs the neutral renderer and its references")
-    print(tables([run_row(n, a.preset, a.steps, a.blender, a.views) for n in names]))
+    print(tables([run_row(n, a.preset, a.steps, a.blender, a.views, a.joint) for n in names]))
 
 
 if __name__ == "__main__":

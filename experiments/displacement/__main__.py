@@ -13,13 +13,11 @@ from __future__ import annotations
 
 import argparse
 import json
-import subprocess
-import sys
-from pathlib import Path
 
-ROOT = Path(__file__).resolve().parents[2]
-REFERENCES = ROOT.parent / "shared" / "judge" / "references"
-OUT = ROOT / "out" / "displacement"
+from experiments.common import OUT as RESULTS
+from experiments.common import Kept, isolated, source_of
+
+OUT = RESULTS / "displacement"
 LEVEL, FACTOR = 3, 16
 KINDS: dict[str, dict] = {
     "normal map alone": {},
@@ -39,30 +37,12 @@ print(json.dumps({"seconds": r.seconds, "steps": r.fit.steps, "drawn": r.shown.t
 """
 
 
-def source_of(asset: str) -> Path:
-    """The file of an asset; the relic is built when it is not there."""
-    if asset != "relic":
-        return REFERENCES / f"{asset}.glb"
-    path = OUT / "relic.glb"
-    if not path.exists():
-        path.parent.mkdir(parents=True, exist_ok=True)
-        subprocess.run([sys.executable, "-m", "scenes.build", "relic", str(path)], check=True, cwd=ROOT)
-    return path
-
-
-def run(code: str, *arguments: str) -> dict:
-    """Run a snippet in a fresh process; its last line is JSON."""
-    command = [sys.executable, "-c", code, *arguments]
-    done = subprocess.run(command, check=True, capture_output=True, text=True, cwd=ROOT)
-    return json.loads(done.stdout.splitlines()[-1])
-
-
 def labour(asset: str, kind: str, triangles: int, common: dict) -> dict:
     """One row."""
     values = {**KINDS[kind], **common}
     values["triangles"] = triangles * values.pop("factor", 1)
     out = OUT / f"{asset}_{kind.replace(' ', '_')}.glb"
-    return run(SIMPLIFY, str(source_of(asset)), str(out), json.dumps(values))
+    return isolated(SIMPLIFY, str(source_of(asset)), str(out), json.dumps(values))
 
 
 def table(rows: list[dict]) -> str:
@@ -93,18 +73,14 @@ def main() -> None:
     parser.add_argument("--table", action="store_true")
     a = parser.parse_args()
     OUT.mkdir(parents=True, exist_ok=True)
-    path = OUT / "results.json"
-    rows = json.loads(path.read_text()) if path.exists() else []
+    kept = Kept(OUT / "results.json")
     common = {"budget": a.budget} if a.steps is None else {"steps": a.steps}
     for asset in a.assets.split(",") if not a.table else ():
         for kind in a.kinds.split(","):
             key = {"asset": asset, "kind": kind, "base": a.triangles, "common": common}
-            if any(all(r[k] == v for k, v in key.items()) for r in rows):
-                continue
-            rows.append({**key, **labour(asset, kind, a.triangles, common)})
-            path.write_text(json.dumps(rows, indent=1))
-            print(table(rows[-1:]).splitlines()[2], flush=True)
-    print(table(rows))
+            row = kept.row(key, lambda asset=asset, kind=kind: labour(asset, kind, a.triangles, common))
+            print(table([row]).splitlines()[2], flush=True)
+    print(table(kept.rows))
 
 
 if __name__ == "__main__":

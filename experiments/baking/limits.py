@@ -1,0 +1,110 @@
+"""What could maps still gain while the shape of the light mesh stands still?
+
+    python -m experiments.baking.limits [--rows chess_king,flight_helmet,relic] [--steps 200] [--views 12]
+
+Three figures for each asset's closed-form bake (``out/baking/<asset>_closed.glb``, which ``experiments.baking`` makes),
+all of the same views of 256 x 256, by the renderer of the fit:
+
+- how much of the squared error lies in pixels that an outline of either mesh crosses: no map reaches those;
+- the PSNR if every other pixel were perfect: what no map, and no colour that changes with the view, can exceed;
+- the PSNR of maps that were fitted to these very views: what maps of this size reach when they know the answers. A
+  map has one value for a point, whichever way it is looked at; where HIGH lies before or behind LOW, each view wants
+  another.
+
+Results are kept row by row in ``out/baking/limits.json``.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from experiments.common import OUT, Kept, source_of
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+RESOLUTION, SIZE = 256, 1024
+RATE = 0.004
+"""Rate of the maps, about that of a fit that starts at 30 dB."""
+
+
+def outline_share(reference: NDArray, candidate: NDArray) -> tuple[float, float, float]:
+    """(PSNR over covered pixels, share of the squared error in pixels that are not fully covered in both images,
+    PSNR if the others were perfect), means over views."""
+    from appearance_opt.render.display import display
+
+    rows = []
+    for r, c in zip(reference, candidate, strict=True):
+        error = np.mean((display(r) - display(c)) ** 2, axis=-1)
+        either = (r[..., 3] > 0) | (c[..., 3] > 0)
+        outline = either & ((r[..., 3] < 1 - 1e-4) | (c[..., 3] < 1 - 1e-4))
+        total, left = error[either].sum(), error[outline].sum()
+        rows.append([-10 * np.log10(total / either.sum()), left / total, -10 * np.log10(left / either.sum())])
+    psnr, share, bound = np.mean(rows, axis=0)
+    return float(psnr), float(share), float(bound)
+
+
+def limits(asset: str, steps: int, views: int) -> dict:
+    """One row."""
+    from appearance_opt import backend, bake_options, load
+    from appearance_opt.baking.closed_form import Settings, bake
+    from appearance_opt.fit.loop import FitOptions, fit
+    from appearance_opt.fit.model import Model, Rates
+    from appearance_opt.fit.validation import Validation
+    from appearance_opt.jobs.bake import BakeJob
+    from appearance_opt.jobs.fitting import POOL_SAMPLES, Stopwatch, point_width
+    from appearance_opt.reference.pool import ReferencePool
+    from appearance_opt.views import Views
+
+    backend.select("cpu")
+    low = load(OUT / "baking" / f"{asset}_closed.glb")
+    job = BakeJob(load(source_of(asset)), low, asset, bake_options(texture_size=SIZE), Stopwatch())
+    maps = dict(bake(job.reference, job.mesh, Settings(SIZE, samples=4)).maps)
+    sampler = job.sampler.held_out(3)
+    drawn = Views.concatenate([sampler.draw(k, 4) for k in range(views // 4)])
+    model = Model(job.mesh, maps, frozenset({"normal", "material"}), Rates(0, RATE, RATE, RATE, 0))
+    exact = Validation(job.reference, drawn, RESOLUTION, 16)
+    images = job.reference.render(drawn, RESOLUTION, 16)
+    psnr, share, bound = outline_share(images, exact.render(model))
+    # the pool draws the same groups of four from the same stream: it holds these views and no other
+    pool = ReferencePool(
+        job.reference, sampler, 4 * (views // 4), 4, RESOLUTION, POOL_SAMPLES, point_width(RESOLUTION, SIZE)
+    )
+    fit(model, pool, exact, FitOptions(steps=steps, laplacian=0.0))
+    known, _, _ = outline_share(images, exact.render(model))
+    return {"closed": psnr, "outline_share": share, "bound": bound, "knows_the_views": known}
+
+
+def table(rows: list[dict]) -> str:
+    """Markdown."""
+    lines = [
+        "| asset | closed form | error in outlines | all other pixels perfect | maps fitted to these very views |",
+        "|---|---|---|---|---|",
+    ]
+    for r in rows:
+        lines.append(
+            f"| {r['asset']} | {r['closed']:.2f} | {100 * r['outline_share']:.0f} % | {r['bound']:.2f} | "
+            f"{r['knows_the_views']:.2f} ({r['knows_the_views'] - r['closed']:+.2f}) |"
+        )
+    return "\n".join(lines)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--rows", default="chess_king,flight_helmet,relic")
+    parser.add_argument("--steps", type=int, default=200)
+    parser.add_argument("--views", type=int, default=12)
+    a = parser.parse_args()
+    kept = Kept(Path(OUT / "baking" / "limits.json"))
+    for asset in a.rows.split(","):
+        key = {"asset": asset, "steps": a.steps, "views": a.views}
+        print(table([kept.row(key, lambda asset=asset: limits(asset, a.steps, a.views))]), flush=True)
+    print(table(kept.rows))
+
+
+if __name__ == "__main__":
+    main()
