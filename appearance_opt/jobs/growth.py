@@ -9,6 +9,7 @@ an atlas of full size.
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -51,8 +52,12 @@ TEXTURE, RESOLUTION, VIEWS, POOL, POOL_SAMPLES, POINT_WIDTH = 256, 160, 8, 320, 
 TRIANGLES_PER_STRENGTH = 1500
 """Smoothing strength of the steps grows with the triangles, so that the same part of the surface moves together."""
 
-RATES = Rates(position=0.1, normal=0.01, base_color=0.02, material=0.01)
-"""The position's rate is in units of the object's radius: preconditioned steps know no edge length."""
+INSIDE, ROUND = 0.95, 0.6
+"""Size of the first ellipsoid in units of the box of the object, and of the sphere in units of its radius."""
+
+RATES = Rates(position=0.4, normal=0.01, base_color=0.02, material=0.01)
+"""The position's rate is in units of the object's radius: preconditioned steps know no edge length.
+After 200 steps from an ellipsoid, chess_king in grey is at 18.7 dB with 0.1, 23.7 with 0.2, 24.5 with 0.4."""
 
 
 def grown(
@@ -66,7 +71,7 @@ def grown(
 ) -> tuple[Start, bool]:
     """(start, interrupted) after at most ``seconds`` or ``steps``. Only images of the reference are used."""
     texture = min(TEXTURE, options.texture_size)
-    mesh = sphere(OVERSAMPLING * triangles, sampler.centre, 0.6 * sampler.radius, texture)
+    mesh = stretched(sphere(OVERSAMPLING * triangles, (0.0, 0.0, 0.0), 1.0, texture), sampler)
     maps = random_maps(texture, options.seed, options.normal_map and "normal" in options.fit)
     model = Model(mesh, maps, frozenset(options.fit), RATES)
     model.precondition(len(mesh.faces) / TRIANGLES_PER_STRENGTH, RATES.position)
@@ -89,6 +94,18 @@ def grown(
     if not len(faces):
         raise InputError("nothing is left of the grown mesh at that budget; ask for more triangles")
     return transferred(source, unwrap(positions, faces, options.texture_size), options), result.interrupted
+
+
+def stretched(ball: LatentMesh, sampler: ViewSampler) -> LatentMesh:
+    """The unit sphere around the origin as an ellipsoid that nearly fills the box that views are framed to (a sphere of
+    ``ROUND`` of the sampler's radius where they are not framed). A round one leaves the ends of a long object to a few
+    vertices, which do not arrive there while the steps are still large."""
+    centre, half = np.asarray(sampler.centre, np.float64), np.full(3, ROUND * sampler.radius)
+    if sampler.hull is not None:
+        low, high = sampler.hull.min(axis=0), sampler.hull.max(axis=0)
+        # not too flat: steps are limited, and opposite sides must not pass through each other
+        centre, half = (low + high) / 2, INSIDE * np.maximum((high - low) / 2, 0.1 * sampler.radius)
+    return replace(ball, positions=(ball.positions * half + centre).astype(np.float32))
 
 
 def kept(path: Path, fingerprint: str, make: Callable[[], tuple[Start, bool]]) -> tuple[Start, bool]:

@@ -86,12 +86,12 @@ def table(rows: list[dict]) -> str:
     for r in rows:
         s, d, c = (r[k] for k in ("start", "damaged", "cleaned"))
         share = ", ".join(f"{won_back(r, n):.0f} %" for n in ("volume", "silhouette_shift", "flip"))
-        lines.append(
-            f"| {r['asset']} | {', '.join(r['kinds'])} | {r['way']} | {s['psnr_covered']:.1f}, "
-            f"{d['psnr_covered']:.1f}, {c['psnr_covered']:.1f} | {s['silhouette_shift']:.2f}, {d['silhouette_shift']:.2f}, "
-            f"{c['silhouette_shift']:.2f} | {d['volume'] / s['volume']:.3f}, {c['volume'] / s['volume']:.3f} | "
-            f"{s['pieces']}, {d['pieces']}, {c['pieces']} | {share} |"
-        )
+        psnr = ", ".join(f"{x['psnr_covered']:.1f}" for x in (s, d, c))
+        shift = ", ".join(f"{x['silhouette_shift']:.2f}" for x in (s, d, c))
+        size = ", ".join(f"{x['volume'] / s['volume']:.3f}" for x in (d, c))
+        count = ", ".join(str(x["pieces"]) for x in (s, d, c))
+        names = f"{r['asset']} | {', '.join(r['kinds'])} | {r['way']}"
+        lines.append(f"| {names} | {psnr} | {shift} | {size} | {count} | {share} |")
     return "\n".join(lines)
 
 
