@@ -2,8 +2,8 @@
 
     python -m experiments.baking.limits [--rows chess_king,flight_helmet,relic] [--steps 200] [--views 12]
 
-Three figures for each asset's closed-form bake (``out/baking/<asset>_closed.glb``, which ``experiments.baking`` makes),
-all of the same views of 256 x 256, by the renderer of the fit:
+Three figures for the closed-form bake of each pair of ``experiments.baking``, all of the same views of 256 x 256,
+by the renderer of the fit:
 
 - how much of the squared error lies in pixels that an outline of either mesh crosses: no map reaches those;
 - the PSNR if every other pixel were perfect: what no map, and no colour that changes with the view, can exceed;
@@ -17,12 +17,13 @@ Results are kept row by row in ``out/baking/limits.json``.
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from experiments.common import OUT, Kept, source_of
+from experiments.baking.__main__ import OUT as FOLDER
+from experiments.baking.__main__ import ROWS, make_low
+from experiments.common import Kept, source_of
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -61,8 +62,11 @@ def limits(asset: str, steps: int, views: int) -> dict:
     from appearance_opt.views import Views
 
     backend.select("cpu")
-    low = load(OUT / "baking" / f"{asset}_closed.glb")
-    job = BakeJob(load(source_of(asset)), low, asset, bake_options(texture_size=SIZE), Stopwatch())
+    source, low = source_of(asset), FOLDER / f"{asset}_low.glb"
+    if not low.exists():
+        FOLDER.mkdir(parents=True, exist_ok=True)
+        make_low(source, ROWS[asset], low)
+    job = BakeJob(load(source), load(low), asset, bake_options(texture_size=SIZE), Stopwatch())
     maps = dict(bake(job.reference, job.mesh, Settings(SIZE, samples=4)).maps)
     sampler = job.sampler.held_out(3)
     drawn = Views.concatenate([sampler.draw(k, 4) for k in range(views // 4)])
@@ -99,7 +103,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=200)
     parser.add_argument("--views", type=int, default=12)
     a = parser.parse_args()
-    kept = Kept(Path(OUT / "baking" / "limits.json"))
+    kept = Kept(FOLDER / "limits.json")
     for asset in a.rows.split(","):
         key = {"asset": asset, "steps": a.steps, "views": a.views}
         print(table([kept.row(key, lambda asset=asset: limits(asset, a.steps, a.views))]), flush=True)

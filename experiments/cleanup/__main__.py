@@ -27,7 +27,7 @@ from experiments.common import Kept, source_of
 OUT = RESULTS / "cleanup"
 TRIANGLES = {"chess_king": 2432, "flight_helmet": 4622}
 WAYS = ("init", "joint")
-VIEWS, LEVEL, POSITION_RATE = 12, 2, 0.02
+VIEWS, LEVEL, POSITION_RATE = 8, 2, 0.02
 
 
 def measured(source: Path, asset: Asset) -> tuple[dict, np.ndarray]:
