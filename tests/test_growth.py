@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 import appearance_opt
-from appearance_opt.asset.types import Asset
+from appearance_opt.asset import save
+from appearance_opt.asset.types import Asset, Mesh
 from appearance_opt.config import SimplifyOptions, simplify_options
 from appearance_opt.errors import InputError
 from appearance_opt.fit import adam
@@ -91,6 +92,24 @@ def test_spheres_start_in_the_box_of_the_object() -> None:
     np.testing.assert_allclose(np.ptp(p, axis=0), np.array([4.0, 8.0, 2.0]) * 0.95, rtol=0.03)
     p = stretched(ball, ViewSampler((1.0, 0.0, 0.0), 10.0, 0)).positions
     np.testing.assert_allclose(np.linalg.norm(p - (1.0, 0.0, 0.0), axis=1), 6.0, rtol=1e-5)
+
+
+def test_a_spoilt_mesh_is_mended(ball: Asset, tmp_path: Path) -> None:
+    # 300 triangles; a quarter of the volume is lost, and the cap is torn off and lies aside
+    mesh = sphere(300, (0.0, 0.0, 0.0), 0.9, 64)
+    p = mesh.positions[mesh.faces].reshape(-1, 3)
+    cap = np.repeat(p.reshape(-1, 3, 3)[..., 1].mean(axis=1) > 0.6, 3)
+    p[cap] += np.array([0.15, 0.1, 0.0], np.float32)
+    bad = tmp_path / "bad.obj"
+    save(Asset((Mesh(p, np.arange(len(p), dtype=np.int32).reshape(-1, 3)),), "bad"), bad)
+    kept_shape = simplify(ball, None, options(triangles=None, init=str(bad), steps=0))
+    result = simplify(ball, None, options(triangles=None, init=str(bad), steps=100, relative=False))
+    assert result.triangles == len(mesh.faces)
+    before, after = (
+        appearance_opt.compare(ball, x, views=3, resolution=64).metrics for x in (kept_shape.asset, result.asset)
+    )
+    assert after.silhouette_shift < 0.4 * before.silhouette_shift
+    assert after.psnr_covered > before.psnr_covered + 5
 
 
 def test_a_resumed_growth_goes_on_from_the_same_start(ball: Asset, tmp_path: Path) -> None:

@@ -1,4 +1,5 @@
-"""From a sphere to a first likeness: the start where there is no mesh to decimate, or none is to be used.
+"""Starts whose shape is far from its goal: grown from a sphere, where there is no mesh to decimate, or mended from a
+mesh that another tool has spoilt.
 
 The sphere gets several times the triangles of the budget, small maps, small views and preconditioned steps
 (``fit.smoothing``): shape first. What comes out is decimated to the budget like any other mesh, which puts triangles
@@ -9,19 +10,20 @@ an atlas of full size.
 from __future__ import annotations
 
 import logging
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from appearance_opt.errors import InputError
 from appearance_opt.fit import archive
-from appearance_opt.fit.loop import FitOptions, fit
+from appearance_opt.fit.loop import FitOptions, FitResult, fit
 from appearance_opt.fit.model import Model, Rates
 from appearance_opt.fit.validation import Validation
 from appearance_opt.initial.atlas import unwrap
 from appearance_opt.initial.decimate import decimate
 from appearance_opt.initial.sphere import random_maps, sphere
+from appearance_opt.initial.transfer import transfer
 from appearance_opt.jobs.fitting import VALIDATION_VIEWS, clean_maps
 from appearance_opt.jobs.start import Start, transferred
 from appearance_opt.latent.export import to_asset
@@ -30,7 +32,7 @@ from appearance_opt.reference.mesh import MeshReference
 from appearance_opt.reference.pool import ReferencePool
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Mapping
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -59,41 +61,75 @@ RATES = Rates(position=0.4, normal=0.01, base_color=0.02, material=0.01)
 """The position's rate is in units of the object's radius: preconditioned steps know no edge length.
 After 200 steps from an ellipsoid, chess_king in grey is at 18.7 dB with 0.1, 23.7 with 0.2, 24.5 with 0.4."""
 
+MENDING_RATE = 0.1
+"""The same for a mesh that is spoilt, not unknown: it has less far to go."""
+
+
+@dataclass(frozen=True)
+class Effort:
+    """How long the shape is fitted (whichever comes first), and who is told."""
+
+    seconds: float | None
+    steps: int | None
+    progress: Progress | None = None
+
 
 def grown(
-    reference: Reference,
-    sampler: ViewSampler,
-    options: SimplifyOptions,
-    triangles: int,
-    seconds: float | None,
-    steps: int | None,
-    progress: Progress | None = None,
+    reference: Reference, sampler: ViewSampler, options: SimplifyOptions, triangles: int, effort: Effort
 ) -> tuple[Start, bool]:
-    """(start, interrupted) after at most ``seconds`` or ``steps``. Only images of the reference are used."""
+    """(start, interrupted), grown from a sphere. Only images of the reference are used."""
     texture = min(TEXTURE, options.texture_size)
     mesh = stretched(sphere(OVERSAMPLING * triangles, (0.0, 0.0, 0.0), 1.0, texture), sampler)
     maps = random_maps(texture, options.seed, options.normal_map and "normal" in options.fit)
-    model = Model(mesh, maps, frozenset(options.fit), RATES)
-    model.precondition(len(mesh.faces) / TRIANGLES_PER_STRENGTH, RATES.position)
-    pool = ReferencePool(reference, sampler, POOL, VIEWS, RESOLUTION, POOL_SAMPLES, POINT_WIDTH)
-    validation = Validation(reference, sampler.held_out(1).draw(0, VALIDATION_VIEWS), RESOLUTION)
-    fit_options = FitOptions(
-        steps=steps,
-        seconds=seconds,
-        loss=options.loss,
-        laplacian=0.0,
-        decay=1.0,
-        background=options.background_color(),
-        seed=options.seed,
-    )
-    result = fit(model, pool, validation, fit_options, progress)
-    log.info("grown from a sphere: %d steps, %.2f dB", result.steps, result.curve[-1].psnr)
+    model, result = _shaped(reference, sampler, options, mesh, maps, RATES, effort)
     likeness = to_asset(mesh, model.host_positions(), clean_maps(model, np.zeros((texture, texture), bool)), "grown")
     source = MeshReference(likeness)
     positions, faces = decimate(source.merged.positions, source.merged.faces, triangles)
     if not len(faces):
         raise InputError("nothing is left of the grown mesh at that budget; ask for more triangles")
     return transferred(source, unwrap(positions, faces, options.texture_size), options), result.interrupted
+
+
+def mended(
+    reference: MeshReference, sampler: ViewSampler, options: SimplifyOptions, spoilt: Start, effort: Effort
+) -> tuple[Start, bool]:
+    """(start, interrupted): the mesh of a spoilt start moved to where images want it, its triangles kept; atlas and
+    maps are made anew. Neighbours move together, so that lost volume comes back and a patch that lies
+    off moves as a whole, where steps of single vertices would crumple it."""
+    found = transfer(reference, spoilt.mesh, min(TEXTURE, options.texture_size))
+    maps = {n: v for n, v in found.maps.items() if options.normal_map or not n.startswith("normal")}
+    rates = replace(RATES, position=MENDING_RATE)
+    model, result = _shaped(reference, sampler, options, spoilt.mesh, maps, rates, effort)
+    mesh = unwrap(model.host_positions(), spoilt.mesh.faces, options.texture_size)
+    return transferred(reference, mesh, options), result.interrupted
+
+
+def _shaped(
+    reference: Reference,
+    sampler: ViewSampler,
+    options: SimplifyOptions,
+    mesh: LatentMesh,
+    maps: Mapping[str, NDArray],
+    rates: Rates,
+    effort: Effort,
+) -> tuple[Model, FitResult]:
+    """A mesh with maps after preconditioned steps; the model is left at its best state."""
+    model = Model(mesh, maps, frozenset(options.fit), rates)
+    model.precondition(len(mesh.faces) / TRIANGLES_PER_STRENGTH, rates.position)
+    pool = ReferencePool(reference, sampler, POOL, VIEWS, RESOLUTION, POOL_SAMPLES, POINT_WIDTH)
+    validation = Validation(reference, sampler.held_out(1).draw(0, VALIDATION_VIEWS), RESOLUTION)
+    fit_options = FitOptions(
+        steps=effort.steps,
+        seconds=effort.seconds,
+        loss=options.loss,
+        laplacian=0.0,
+        decay=1.0,
+        background=options.background_color(),
+        seed=options.seed,
+    )
+    result = fit(model, pool, validation, fit_options, effort.progress)
+    log.info("shape by preconditioned steps: %d of them, %.2f dB", result.steps, result.curve[-1].psnr)
+    return model, result
 
 
 def stretched(ball: LatentMesh, sampler: ViewSampler) -> LatentMesh:

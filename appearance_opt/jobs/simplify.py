@@ -17,12 +17,15 @@ from appearance_opt.config import CommonOptions, SimplifyOptions, as_dict, with_
 from appearance_opt.errors import DivergedError, InputError
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from numpy.typing import NDArray
 
     from appearance_opt.asset.types import Asset
     from appearance_opt.fit.checkpoint import Checkpointer
     from appearance_opt.fit.loop import FitResult, Progress
     from appearance_opt.jobs.fitting import Stopwatch
+    from appearance_opt.jobs.growth import Effort
     from appearance_opt.jobs.start import Start
 
 log = logging.getLogger(__name__)
@@ -143,6 +146,7 @@ class _Job:
         with_report: bool,
     ) -> None:
         from appearance_opt.jobs.fitting import seconds_left
+        from appearance_opt.jobs.growth import grown, mended
         from appearance_opt.jobs.start import budget, loaded_start, make_start
         from appearance_opt.reference.mesh import MeshReference
         from appearance_opt.views import ViewSampler, framing
@@ -159,7 +163,8 @@ class _Job:
             (0.0, 0.0, 0.0), 1.0, options.seed, hull=support(self.reference.merged.positions), light=options.light
         )
         if options.init == "sphere" and "shape" in options.fit and not options.displaced:
-            self.start = self._grown(budget(options, asset.triangle_count))
+            triangles = budget(options, asset.triangle_count)
+            self.start = self._shaped(lambda effort: grown(self.reference, self.sampler, options, triangles, effort))
         elif options.init in ("decimate", "sphere"):
             triangles = budget(options, asset.triangle_count)
             left = seconds_left(options, watch, with_report)
@@ -168,28 +173,27 @@ class _Job:
             self.start = loaded_start(
                 Path(options.init), (np.array(self.frame[0]), self.frame[1]), self.reference, options
             )
+            if options.relative is False and "shape" in options.fit and not options.displaced:
+                spoilt = self.start
+                self.start = self._shaped(lambda effort: mended(self.reference, self.sampler, options, spoilt, effort))
+                # the shape has been let go of; the mended one is a likeness
+                self.options = with_values(self.options, relative=None)
         self.asset = asset
         watch.lap("start")
 
-    def _grown(self, triangles: int) -> Start:
-        """A start grown from a sphere, in a part of the time or the steps."""
+    def _shaped(self, make_within: Callable[[Effort], tuple[Start, bool]]) -> Start:
+        """A start whose shape is fitted first, in a part of the time or the steps."""
         from appearance_opt.jobs.fitting import seconds_left
-        from appearance_opt.jobs.growth import SHARE, grown, kept
+        from appearance_opt.jobs.growth import SHARE, Effort, kept
 
         o = self.options
         seconds = seconds_left(o, self.watch, self.with_report)
         steps = 1000 if o.steps is None and seconds is None else o.steps
+        share = None if seconds is None else SHARE * seconds
+        effort = Effort(share, None if steps is None else round(SHARE * steps), self.progress)
 
         def make() -> tuple[Start, bool]:
-            return grown(
-                self.reference,
-                self.sampler,
-                o,
-                triangles,
-                None if seconds is None else SHARE * seconds,
-                None if steps is None else round(SHARE * steps),
-                self.progress,
-            )
+            return make_within(effort)
 
         if self.checkpointer is None:
             start, interrupted = make()

@@ -27,7 +27,7 @@ from experiments.common import Kept, source_of
 OUT = RESULTS / "cleanup"
 TRIANGLES = {"chess_king": 2432, "flight_helmet": 4622}
 WAYS = ("init", "joint")
-VIEWS, LEVEL, POSITION_RATE = 8, 2, 0.02
+VIEWS, LEVEL = 8, 2
 
 
 def measured(source: Path, asset: Asset) -> tuple[dict, np.ndarray]:
@@ -47,7 +47,7 @@ def mended(source: Path, bad: Path, way: str, common: dict) -> ao.SimplifyResult
 
     if way == "joint":
         return joint(source, bad, None, ao.bake_options(joint=True, subdivision=(LEVEL,), **common))
-    options = ao.simplify_options(init=str(bad), relative=False, position_rate=POSITION_RATE, **common)
+    options = ao.simplify_options(init=str(bad), relative=False, **common)
     return ao.simplify(source, None, options)
 
 

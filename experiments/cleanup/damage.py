@@ -32,7 +32,7 @@ def damaged(asset: Asset, kinds: tuple[str, ...] = DAMAGES, seed: int = 0) -> As
             near = _patch(p, rng, 0.06 * size)
             p[near] -= normals[near] * 0.05 * size
     if "detached" in kinds:
-        p, faces, place = _detached(p, faces, place, mesh.faces, rng, size)
+        p, place, mesh = _detached(p, place, mesh, rng, size)
     positions = p[place].astype(np.float32)
     mesh = replace(mesh, positions=positions, normals=vertex_normals(positions, mesh.faces), tangents=None)
     if "texture" in kinds:
@@ -65,20 +65,24 @@ def _patch(p: NDArray, rng: np.random.Generator, radius: float) -> NDArray[np.bo
 
 
 def _detached(
-    p: NDArray, faces: NDArray, place: NDArray, split: NDArray, rng: np.random.Generator, size: float
-) -> tuple[NDArray, NDArray, NDArray]:
-    """Patches of faces cut out and moved. ``place`` maps the vertices of the file, whose faces are ``split``;
-    a file vertex that lies on the cut goes with the patch."""
-    centres = p[faces].mean(axis=1)
-    place, points = place.copy(), p
+    p: NDArray, place: NDArray, mesh: Mesh, rng: np.random.Generator, size: float
+) -> tuple[NDArray, NDArray, Mesh]:
+    """Patches of faces cut out and moved off. ``place``: the point of ``p`` of each vertex of the file; vertices on a
+    cut are doubled. Returns both and the mesh with the new vertices, whose positions are still to be set."""
+    centres = p[place[mesh.faces]].mean(axis=1)
     for _ in range(3):
         near = np.linalg.norm(centres - centres[rng.integers(len(centres))], axis=1) < 0.12 * size
         shift = rng.normal(size=3)
-        moved = np.unique(split[near])
-        copies = points[place[moved]] + shift / np.linalg.norm(shift) * 0.04 * size
-        place[moved] = len(points) + np.arange(len(moved))
-        points = np.concatenate([points, copies])
-    return points, place[split], place
+        inside, local = np.unique(mesh.faces[near], return_inverse=True)
+        faces = mesh.faces.copy()
+        faces[near] = (len(place) + local.reshape(-1, 3)).astype(np.int32)
+        assert mesh.uvs is not None
+        index = np.concatenate([np.arange(len(place)), inside])
+        mesh = replace(mesh, positions=mesh.positions[index], faces=faces, uvs=mesh.uvs[index])
+        points, joined = np.unique(place[inside], return_inverse=True)
+        place = np.concatenate([place, len(p) + joined])
+        p = np.concatenate([p, p[points] + shift / np.linalg.norm(shift) * 0.04 * size])
+    return p, place, mesh
 
 
 def _retextured(mesh: Mesh, rng: np.random.Generator) -> Mesh:
