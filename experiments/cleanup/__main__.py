@@ -30,15 +30,15 @@ WAYS = ("init", "joint")
 VIEWS, LEVEL = 8, 2
 
 
-def measured(source: Path, asset: Asset) -> tuple[dict, np.ndarray]:
-    """Look and shape of a candidate, and its image beside the reference's."""
+def measured(source: Path, asset: Asset, box: tuple[np.ndarray, np.ndarray]) -> tuple[dict, np.ndarray]:
+    """Look and shape of a candidate (its volume as a share of a box), and its image beside the reference's."""
     from appearance_opt.render.display import display
 
     compared = ao.compare(source, asset, views=VIEWS)
     names = ("psnr_covered", "flip", "silhouette_shift", "silhouette_iou")
     look = {n: getattr(compared.metrics, n) for n in names}
     images = np.stack([display(i[:2]).reshape(-1, *i.shape[2:3], 3) for i in (compared.reference, compared.candidate)])
-    return {**look, "volume": volume(asset), "pieces": pieces(asset)}, images
+    return {**look, "volume": volume(asset, box), "pieces": pieces(asset)}, images
 
 
 def mended(source: Path, bad: Path, way: str, common: dict) -> ao.SimplifyResult:
@@ -62,7 +62,10 @@ def row(asset: str, kinds: tuple[str, ...], way: str, common: dict) -> dict:
     ao.save(spoilt, bad)
     result = mended(source, bad, way, common)
     ao.save(result.shown, bad.with_name(f"{bad.stem}_{way}.glb"))
-    states = {n: measured(source, v) for n, v in (("start", good), ("damaged", spoilt), ("cleaned", result.shown))}
+    states = {
+        n: measured(source, v, good.bounds())
+        for n, v in (("start", good), ("damaged", spoilt), ("cleaned", result.shown))
+    }
     strip = np.concatenate([states["start"][1][0], *(images[1] for _, images in states.values())], axis=1)
     picture = encode_png((np.clip(strip, 0, 1) * 255 + 0.5).astype(np.uint8))
     bad.with_name(f"{bad.stem}_{way}.png").write_bytes(picture)
@@ -71,9 +74,9 @@ def row(asset: str, kinds: tuple[str, ...], way: str, common: dict) -> dict:
 
 
 def won_back(r: dict, name: str) -> float:
-    """Share of the damage in one measure that was undone."""
+    """Share, in percent, of the damage in one measure that was undone: negative if it grew."""
     before, after, good = (r[k][name] for k in ("damaged", "cleaned", "start"))
-    return 100 * (after - before) / (good - before) if good != before else 100.0
+    return 100 * (1 - abs(after - good) / abs(before - good)) if good != before else 100.0
 
 
 def table(rows: list[dict]) -> str:
