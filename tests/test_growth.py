@@ -78,6 +78,7 @@ def test_a_grown_sphere_becomes_the_object(ball: Asset) -> None:
     target = replace(ball, meshes=(pear,))
     result = simplify(target, None, options(steps=120))
     assert result.triangles <= 200
+    # measured 24.4 dB, 42 + 78 steps, and 0.05 of the extent
     assert appearance_opt.compare(target, result.asset, views=3, resolution=64).metrics.psnr_covered > 20
     extent = np.ptp(result.asset.meshes[0].positions, axis=0)
     np.testing.assert_allclose(extent, np.ptp(pear.positions, axis=0), atol=0.1)

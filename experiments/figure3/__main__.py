@@ -42,15 +42,20 @@ closed = {}
 for name in ("start", "result"):
     low = a.load(stem + ("_start.glb" if name == "start" else ".glb"))
     bake = a.bake_options(closed_form=True, texture_size=options.texture_size)
-    closed[name] = a.bake(asset, low, stem + "_" + name + "_closed.glb", bake).asset
+    try:
+        closed[name] = a.bake(asset, low, stem + "_" + name + "_closed.glb", bake).asset
+    except a.InputError as error:  # a baker needs a light mesh that lies near the heavy one
+        print(error, file=sys.stderr)
 names = ("psnr_covered", "psnr", "flip", "silhouette_shift")
 def scores(x):
+    if x is None:
+        return None
     m = compare(asset, x, views=o["views"], resolution=o["resolution"]).metrics
     return {n: getattr(m, n) for n in names}
 print(json.dumps({"seconds": result.seconds, "steps": result.fit.steps, "triangles": result.triangles,
                   "source_triangles": asset.triangle_count,
                   "start": scores(result.start), "result": scores(result.asset),
-                  "closed_start": scores(closed["start"]), "closed_result": scores(closed["result"])}))
+                  "closed_start": scores(closed.get("start")), "closed_result": scores(closed.get("result"))}))
 """
 
 
@@ -61,8 +66,10 @@ def row(asset: str, start: str, preset: str, common: dict) -> dict:
     return isolated(FIT, str(source_of(asset)), str(FOLDER / f"{asset}_{start}"), json.dumps(values))
 
 
-def cell(scores: dict) -> str:
+def cell(scores: dict | None) -> str:
     """PSNR over covered pixels and over whole images, FLIP, silhouette shift."""
+    if scores is None:
+        return "refused"
     return (
         f"{scores['psnr_covered']:.2f} / {scores['psnr']:.2f} / {scores['flip']:.4f} / {scores['silhouette_shift']:.3f}"
     )
