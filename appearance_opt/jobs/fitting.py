@@ -165,7 +165,7 @@ def effort(psnr: float, likeness: bool) -> tuple[Quality, Rates]:
     """
     if not likeness:
         return Quality(1.0, 4, 1), Rates(0.05, 0.01, 0.02, 0.01, 0.05)
-    rate = 0.006 * float(np.clip(10 ** ((25.0 - psnr) / 30.0), 0.25, 1.0))
+    rate = 0.006 * float(np.clip(10 ** ((25.0 - psnr) / 16.0), 0.2, 2.0))
     return Quality(), Rates(rate, rate, rate, rate, DISPLACEMENT_RATE * rate)
 
 
