@@ -69,9 +69,10 @@ def test_what_is_not_fitted_does_not_exist(ball: Asset) -> None:
         np.testing.assert_array_equal(image, before[name])
 
 
-def test_no_kernel_is_compiled_after_the_first_steps(ball: Asset) -> None:
+@pytest.mark.parametrize("visibility", ["edges", "pairs"])
+def test_no_kernel_is_compiled_after_the_first_steps(ball: Asset, visibility: str) -> None:
     model, pool, validation = make_fit(ball)
-    run = loop._Run(model, pool, validation, FitOptions(steps=100), None, None)
+    run = loop._Run(model, pool, validation, FitOptions(steps=100, quality=Quality(visibility=visibility)), None, None)
     run.look()
     assert settles(run)
 

@@ -271,8 +271,8 @@ def test_pixels_shaded_with_their_loss_have_the_gradient_of_the_whole_image() ->
         assert np.linalg.norm(a - b) < 1e-6 * np.linalg.norm(b)
 
 
-@pytest.mark.parametrize("levels", [(0,), (1, 2)])
-def test_frozen_steps_equal_traced_ones(levels: tuple[int, ...]) -> None:
+@pytest.mark.parametrize(("levels", "visibility"), [((0,), "edges"), ((1, 2), "edges"), ((0,), "pairs")])
+def test_frozen_steps_equal_traced_ones(levels: tuple[int, ...], visibility: str) -> None:
     """Recorded kernels see what moves: vertices, texels, views, images, how many pixels are covered."""
     maps: dict = wavy_maps(32)
     parts = ["shape", "normal", "material"]
@@ -282,7 +282,8 @@ def test_frozen_steps_equal_traced_ones(levels: tuple[int, ...]) -> None:
     model = Model(sphere(300, (0.0, 0.0, 0.0), 0.7, 32), maps, frozenset(parts), Rates(), levels)
     grid, loss = Grid(2, 48), LOSSES["log-srgb-l1"]
     regularizers = laplacians(model, relative=False)
-    frozen, plain = (Gradients(model, grid, Quality(), loss, regularizers, freeze=f) for f in (True, False))
+    quality = Quality(visibility=visibility)
+    frozen, plain = (Gradients(model, grid, quality, loss, regularizers, freeze=f) for f in (True, False))
     moments = {n: adam.moments_of(p) for n, p in model.parameters.items()}
     for k in range(8):
         model.select(levels[k % len(levels)])

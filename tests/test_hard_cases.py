@@ -48,12 +48,20 @@ def front(distance: float = 3.0, fov: float = 40.0, light: tuple = (1.0, 1.0, 3.
     return look_at(np.array([[0, 0, distance]]), np.zeros(3), fov, np.array([light]), power)
 
 
+EDGES, PAIRS = Quality(2.0, 4, 1), Quality(visibility="pairs")
+
+
 def check(
-    mesh: LatentMesh | Model, views: Views, resolution: int = 24, loss: str = "log-srgb-l1", **values: float
+    mesh: LatentMesh | Model,
+    views: Views,
+    resolution: int = 24,
+    loss: str = "log-srgb-l1",
+    quality: Quality = EDGES,
+    **values: float,
 ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """Image (H, W, 4) of the first view and gradients by name, all finite; ``values``: of the maps."""
     model = mesh if isinstance(mesh, Model) else model_of(mesh, **values)
-    grid, quality = Grid(len(views), resolution), Quality(2.0, 4, 1)
+    grid = Grid(len(views), resolution)
     target = np.zeros((grid.pixels, 4), np.float32)
     target[: grid.pixels // 2] = (0.2, 0.3, 0.4, 1.0)
     background = np.full((len(views), 3), 0.4, np.float32)
@@ -95,7 +103,8 @@ def test_one_triangle() -> None:
     ],
 )
 def test_bad_triangles(positions: list, faces: list) -> None:
-    check(latent(positions, faces), front())
+    for quality in (EDGES, PAIRS):
+        check(latent(positions, faces), front(), quality=quality)
 
 
 def test_normals_that_cancel() -> None:
@@ -187,11 +196,13 @@ def test_cameras_in_odd_places(eye: tuple) -> None:
     mesh = sphere(300, (0.0, 0.0, 0.0), 1.0, 32)
     target = np.array(eye) + [0.1, 0.2, -1.0]
     for light in (eye, (0.0, 0.0, 0.0), (3.0, 1.0, 2.0)):
-        check(mesh, look_at(np.array([eye]), target[None], 70.0, np.array([light]), 5.0))
+        for quality in (EDGES, PAIRS):
+            check(mesh, look_at(np.array([eye]), target[None], 70.0, np.array([light]), 5.0), quality=quality)
 
 
 def test_triangles_that_cross_the_plane_of_the_camera() -> None:
     p = [[-1, -0.5, -4], [1, -0.5, -4], [0, -0.5, 6], [0.5, 2, 3.0], [-0.5, 2, 3.0], [0, 0.3, 3.5]]
+    check(latent(p, [[0, 1, 2], [3, 4, 5]]), front(3.0, 60.0), quality=PAIRS)
     image, grads = check(latent(p, [[0, 1, 2], [3, 4, 5]]), front(3.0, 60.0))
     assert image[..., 3].max() == 1
     assert np.abs(grads[POSITIONS]).max() > 0
@@ -222,7 +233,8 @@ def test_edges_whose_third_corner_lies_behind_the_camera_push_outwards() -> None
 def test_grazing_views() -> None:
     for height in (1e-2, 1e-4, 1e-6, 0.0):
         views = look_at(np.array([[3.0, 0, height]]), np.zeros(3), 40.0, np.array([[1.0, 0, 2.0]]), 20.0)
-        check(latent(TRIANGLE, [[0, 1, 2]]), views, 32)
+        for quality in (EDGES, PAIRS):
+            check(latent(TRIANGLE, [[0, 1, 2]]), views, 32, quality=quality)
 
 
 def test_pixel_centres_on_edges_and_vertices_are_covered_once() -> None:
@@ -236,7 +248,8 @@ def test_pixel_centres_on_edges_and_vertices_are_covered_once() -> None:
     # an odd number of pixels: centres at multiples of 2 / 9 of the half width, as the vertices
     fov = np.degrees(2 * np.arctan(9 / 8 / 3))
     views = look_at(np.array([[0, 0, 3.0]]), np.zeros(3), fov, np.array([[0, 0, 3.0]]), 20.0)
-    check(mesh, views, n)
+    for quality in (EDGES, PAIRS):
+        check(mesh, views, n, quality=quality)
     model = model_of(mesh)
     surface, maps = model.surface(model.positions()), model.maps(model.fitted_layer())
     image = np.array(render_image(model.scene, surface, maps, views.records(), Grid(1, n), 1)).reshape(n, n, 4)
@@ -264,7 +277,8 @@ def test_views_that_see_nothing_but_the_object() -> None:
 
 @pytest.mark.parametrize("resolution", [1, 2, 3])
 def test_images_of_a_few_pixels(resolution: int, ball: Asset) -> None:
-    check(sphere(100, (0.0, 0.0, 0.0), 1.0, 16), SAMPLER.draw(0, 3), resolution)
+    for quality in (EDGES, PAIRS):
+        check(sphere(100, (0.0, 0.0, 0.0), 1.0, 16), SAMPLER.draw(0, 3), resolution, quality=quality)
     assert MeshReference(ball).render(SAMPLER.draw(0, 2), resolution, 4).shape == (2, resolution, resolution, 4)
 
 

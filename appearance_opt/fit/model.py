@@ -151,6 +151,10 @@ class Model:
         """Connectivity of the drawn mesh."""
         return self.drawn.topology
 
+    def topologies(self) -> dict[int, LatentTopology]:
+        """Connectivity of every level."""
+        return {level: drawn.topology for level, drawn in self._drawn.items()}
+
     @property
     def scene(self) -> mi.Scene:
         """The drawn mesh, for tracing rays."""

@@ -71,7 +71,9 @@ class Gradients:
     ) -> None:
         self.model, self.grid, self.quality, self.loss = model, grid, quality, loss
         self.laplacians = laplacians or {}
-        self._run: Run = Frozen(model.fixed(), self.laplacians, grid) if freeze else traced
+        walks = quality.visibility == "pairs"
+        self._edges = {level: t.walkable if walks else t.edges for level, t in model.topologies().items()}
+        self._run: Run = Frozen(model.fixed(), self.laplacians, grid, self._edges) if freeze else traced
 
     def __call__(self, inputs: StepInputs) -> tuple[mi.Float | None, dict[str, mi.Float]]:
         """Mean image loss (width 1; None without ``want_loss``) and the gradient of every parameter."""
@@ -82,7 +84,7 @@ class Gradients:
         with dr.suspend_grad():
             shape, layer = run(self._unpacked, stored)
             surface = run(self._surface, model.level, shape)
-        edges = model.topology.edges
+        edges = self._edges[model.level]
         frame = gradient.render(
             model.scene, surface, model.maps(layer), edges, records, grid, self.quality, inputs.seed, True, run
         )
@@ -136,7 +138,7 @@ class Gradients:
         want_loss: bool,
     ) -> tuple[mi.Float | None, dict[str, mi.Float]]:
         """(loss of the deferred pixels, gradient of every parameter). ``level``: as in ``_surface``."""
-        model, edges = self.model, self.model.topology.edges
+        model, edges = self.model, self._edges[level]
         shape, layer = model.track(shape, layer)
         posed = model.drawn.pose(shape)
         surface, maps = model.surface(posed), model.maps(layer)

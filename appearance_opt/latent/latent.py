@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import drjit as dr
@@ -13,7 +14,7 @@ from appearance_opt.asset.normals import weld
 from appearance_opt.latent import mesh_ops
 from appearance_opt.latent.mesh_ops import Corners
 from appearance_opt.render import upload
-from appearance_opt.render.silhouette import edge_list
+from appearance_opt.render.silhouette import EdgeList, edge_list, walkable
 from appearance_opt.render.surface import Surface
 
 if TYPE_CHECKING:
@@ -51,9 +52,15 @@ class LatentTopology:
         self.faces = upload.index_packets(mesh.faces)
         self.frame_faces = upload.index_packets(mesh.frame_faces)
         # silhouettes run along welded edges: a seam is none
-        self.edges = edge_list(mesh.faces if mesh.normals is None else welded(mesh.positions, mesh.faces))
+        self.welded_faces = mesh.faces if mesh.normals is None else welded(mesh.positions, mesh.faces)
+        self.edges = edge_list(self.welded_faces)
         self.handedness = mi.Float(handedness(mesh))
         self._fixed = self._fixed_surface() if mesh.normals is not None else None
+
+    @cached_property
+    def walkable(self) -> EdgeList:
+        """The edges with what lies around each face; made when first asked for."""
+        return walkable(self.edges, self.welded_faces)
 
     def surface(self, positions: mi.Float) -> Surface:
         """Surface of flat positions (3 V); differentiable in them. A mesh with its own normals ignores

@@ -16,18 +16,21 @@ one kernel: half the work.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import isqrt
 from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
 
-from appearance_opt.render import coverage, rays, silhouette
+from appearance_opt.render import coverage, meetings, pairs, rays, silhouette
 from appearance_opt.render.deferred import Grid, pixel_index, shade
 from appearance_opt.render.freezing import traced
 from appearance_opt.render.material import MaterialMaps
+from appearance_opt.render.meetings import Meetings
 from appearance_opt.render.rays import MISS, Samples
 from appearance_opt.render.silhouette import EdgeList, EdgeSamples
 from appearance_opt.render.surface import Surface
+from appearance_opt.render.weighted import Weighted, concat, joined
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -35,17 +38,32 @@ if TYPE_CHECKING:
     from appearance_opt.render.freezing import Run
 
 
+VISIBILITY = ("edges", "pairs", "none")
+
+
 @dataclass(frozen=True)
 class Quality:
-    """How finely visibility is sampled. ``edge_density``: silhouette points per pixel of silhouette
-    (0: no visibility gradient); ``edge_samples``: camera rays in each pixel that a silhouette crosses
-    (all other pixels take one)."""
+    """How visibility is sampled, and how its derivative is found.
+
+    ``visibility``: "edges" (``silhouette``), "pairs" (``pairs``), or "none" (silhouettes have no gradient).
+    ``edge_density``: silhouette points per pixel of silhouette (0: none); ``edge_samples``: camera rays in each
+    pixel that a silhouette crosses; both for "edges" only. ``samples``: rays in all (other) pixels; for "pairs" a
+    square number, as neighbours are compared on a regular grid. ``sample_width``, ``point_width``: texture filter
+    in pixels of a pixel that is averaged, and of one that is a single point.
+    """
 
     edge_density: float = 1.0
     edge_samples: int = 8
     samples: int = 1
     sample_width: float = 1.0
     point_width: float = 0.4
+    visibility: str = "edges"
+
+    def __post_init__(self) -> None:
+        if self.visibility not in VISIBILITY:
+            raise ValueError(f"visibility '{self.visibility}' is none of {', '.join(VISIBILITY)}")
+        if self.visibility == "pairs" and isqrt(self.samples) ** 2 != self.samples:
+            raise ValueError(f"pairs need a square number of samples per pixel, not {self.samples}")
 
 
 @dataclass
@@ -56,7 +74,8 @@ class Frame:
     ``averaged``: the covered camera rays that are averaged in it; ``deferred``: those that are not in the image
     yet, each the only one of its pixel; None without any. ``crossed``: indices of the pixels that a silhouette
     crosses; ``edges``: its visible points, None without any; ``contrast``: c_in - c_out at them, premultiplied RGB
-    and coverage.
+    and coverage. ``meetings``, ``meetings_contrast``: the same of surfaces that run into each other, which only pairs
+    see.
     """
 
     grid: Grid
@@ -67,6 +86,8 @@ class Frame:
     crossed: mi.UInt32 | None
     edges: EdgeSamples | None
     contrast: mi.ArrayXf | None
+    meetings: Meetings | None = None
+    meetings_contrast: mi.ArrayXf | None = None
 
     def complete(self) -> mi.Bool | None:
         """(pixels,) which pixels of the image are not deferred; None if none is."""
@@ -75,17 +96,6 @@ class Frame:
         out = dr.full(mi.Bool, True, self.grid.pixels)
         dr.scatter(out, mi.Bool(False), self.deferred.pixel)
         return out
-
-
-@dataclass
-class Weighted:
-    """Covered camera rays, the ``pixel`` of each and its ``weight`` there (None: one), and their ``width`` in
-    pixels, which selects mip levels."""
-
-    samples: Samples
-    pixel: mi.UInt32
-    weight: mi.Float | None
-    width: mi.Float
 
 
 def render(
@@ -103,17 +113,25 @@ def render(
     """Forward pass, without gradients (``surface`` and ``maps`` are read detached). With ``defer``, pixels of
     a single sample are not shaded but left to ``direct``. ``run``: how its stages are called (see ``freezing``)."""
     with dr.suspend_grad():
-        edges = None
-        if edge_list is not None and quality.edge_density > 0:
-            edges = silhouette.sample_edges(
-                scene, edge_list, surface.vertices, records, grid, quality.edge_density, seed, run
-            )
-        averaged, deferred, crossed = _camera_samples(scene, records, grid, edges, quality, defer, run)
-        image, contrast = run(
-            _averages, surface, maps, records, grid.size, grid.rows, grid.pixels, averaged, edges, quality.edge_samples
+        edges, met, filtered = None, None, 1.0
+        if quality.visibility == "pairs" and edge_list is not None:
+            found = pairs.paired_samples(scene, edge_list, surface.vertices, records, grid, quality, defer, run)
+            averaged, deferred, crossed = found.averaged, found.deferred, found.crossed
+            edges, met, filtered = found.edges, found.meetings, quality.sample_width / isqrt(quality.samples)
+        else:
+            if quality.visibility == "edges" and edge_list is not None and quality.edge_density > 0:
+                edges = silhouette.sample_edges(
+                    scene, edge_list, surface.vertices, records, grid, quality.edge_density, seed, run
+                )
+            averaged, deferred, crossed = _camera_samples(scene, records, grid, edges, quality, defer, run)
+        width = dr.opaque(mi.Float, filtered)
+        # pairs blend what few rays miss; elsewhere the silhouette's line knows it
+        corrected = quality.edge_samples if quality.visibility == "edges" else None
+        image, contrast, met_contrast = run(
+            _averages, surface, maps, records, grid.size, grid.rows, grid.pixels, averaged, edges, met, width, corrected
         )
-        dr.eval(image, contrast)
-    return Frame(grid, records, image, averaged, deferred, crossed, edges, contrast)
+        dr.eval(image, contrast, met_contrast)
+    return Frame(grid, records, image, averaged, deferred, crossed, edges, contrast, met, met_contrast)
 
 
 def _averages(
@@ -125,21 +143,26 @@ def _averages(
     pixels: int,
     averaged: Weighted | None,
     edges: EdgeSamples | None,
-    edge_samples: int,
-) -> tuple[mi.Float, mi.ArrayXf | None]:
-    """(image without the deferred pixels, contrast at the silhouette points)."""
+    met: Meetings | None,
+    width: mi.Float,
+    corrected: int | None,
+) -> tuple[mi.Float, mi.ArrayXf | None, mi.ArrayXf | None]:
+    """(image without the deferred pixels, contrast at the silhouette points, and where surfaces meet). ``width`` of the
+    texture filter of contrasts in pixels; ``corrected``: rays per pixel of which the image corrects the coverage."""
     image = dr.zeros(mi.Float, pixels * 4)
     if averaged is not None:
         w = averaged.weight
         c = shade(surface, maps, records, averaged.samples, size, averaged.width)
         value = mi.ArrayXf([c.x * w, c.y * w, c.z * w, w])
         dr.scatter_reduce(dr.ReduceOp.Add, image, value, averaged.pixel, mode=dr.ReduceMode.Local)
-    if edges is None:
-        return image, None
-    contrast = _contrast(surface, maps, records, edges, size)
-    dr.eval(image, contrast)
-    missed = coverage.correction(edges, contrast, pixels, edge_samples, rows)
-    return coverage.corrected(image, missed), contrast
+    contrast, met_contrast = (
+        None if b is None else _contrast(surface, maps, records, b.inside, b.outside, size, width) for b in (edges, met)
+    )
+    if edges is not None and corrected is not None:
+        dr.eval(image, contrast)
+        missed = coverage.correction(edges, contrast, pixels, corrected, rows)
+        image = coverage.corrected(image, missed)
+    return image, contrast, met_contrast
 
 
 def direct(
@@ -167,12 +190,15 @@ def surrogate(
         color = shade(surface, maps, frame.records, a.samples, frame.grid.size, a.width)
         g = _pixel(image_gradient, a.pixel)
         terms.append(dr.fma(g[0], color.x, dr.fma(g[1], color.y, g[2] * color.z)) * a.weight)
-    if frame.edges is not None and edge_list is not None and dr.grad_enabled(surface.vertices):
-        assert frame.contrast is not None
-        g, c = _pixel(image_gradient, frame.edges.pixel), frame.contrast
-        jump = dr.fma(g[0], c[0], dr.fma(g[1], c[1], dr.fma(g[2], c[2], g[3] * c[3]))) * frame.edges.length
-        moved = silhouette.motion(edge_list, surface.vertices, frame.records, frame.edges, frame.grid.size)
-        terms.append(jump * moved)
+    if edge_list is None or not dr.grad_enabled(surface.vertices):
+        return terms
+    moving = (edge_list, surface.vertices, frame.records)
+    if frame.edges is not None:
+        jump = _jump(image_gradient, frame.edges.pixel, frame.contrast)
+        terms.append(jump * frame.edges.length * silhouette.motion(*moving, frame.edges, frame.grid.size))
+    if frame.meetings is not None:
+        jump = _jump(image_gradient, frame.meetings.pixel, frame.meetings_contrast)
+        terms.append(jump * frame.meetings.area * meetings.motion(*moving, frame.meetings, frame.grid.size))
     return terms
 
 
@@ -242,47 +268,42 @@ def _weighted(parts: list[Samples], weights: list[float] | None, grid: Grid, wid
     parts_weights = [(p, w) for p, w in zip(parts, weights or [1.0] * len(parts), strict=True) if dr.width(p.triangle)]
     if not parts_weights:
         return None
-    samples = _concat([p for p, _ in parts_weights])
+    samples = concat([p for p, _ in parts_weights])
     width = dr.opaque(mi.Float, width_of_one)
     pixel = pixel_index(samples, grid.rows)
     if weights is None:
         dr.eval(samples, pixel)
         return Weighted(samples, pixel, None, width)
-    weight = _joined([dr.full(mi.Float, w, dr.width(p.triangle)) for p, w in parts_weights])
+    weight = joined([dr.full(mi.Float, w, dr.width(p.triangle)) for p, w in parts_weights])
     dr.eval(samples, weight, pixel)
     return Weighted(samples, pixel, weight, dr.sqrt(weight) * width)
 
 
-def _concat(parts: list[Samples]) -> Samples:
-    if len(parts) == 1:
-        return parts[0]
-    return Samples(*(_joined([getattr(p, f) for p in parts]) for f in ("view", "x", "y", "triangle")))
-
-
-def _joined(parts: list[mi.Float]) -> mi.Float:
-    """Arrays one after the other. ``dr.concat`` would write their widths, which change every step, into the
-    kernel and so compile one every step."""
-    out = dr.empty(type(parts[0]), sum(dr.width(p) for p in parts))
-    offset = 0
-    for part in parts:
-        index = dr.arange(mi.UInt32, dr.width(part)) + dr.opaque(mi.UInt32, offset)
-        dr.scatter(out, part, index, mode=dr.ReduceMode.Permute)
-        offset += dr.width(part)
-    return out
-
-
 def _contrast(
-    surface: Surface, maps: MaterialMaps, records: mi.Float, edges: EdgeSamples, size: mi.Float
+    surface: Surface,
+    maps: MaterialMaps,
+    records: mi.Float,
+    inside: Samples,
+    outside: Samples,
+    size: mi.Float,
+    width: mi.Float,
 ) -> mi.ArrayXf:
-    """c_in - c_out at the silhouette points: premultiplied RGB and coverage."""
+    """c_in - c_out of samples on the two sides of boundaries: premultiplied RGB and coverage."""
 
     def seen(side: Samples) -> mi.ArrayXf:
         covered = side.triangle != MISS
         hits = Samples(side.view, side.x, side.y, dr.select(covered, side.triangle, 0))
-        color = shade(surface, maps, records, hits, size, mi.Float(1)) & covered
+        color = shade(surface, maps, records, hits, size, width) & covered
         return mi.ArrayXf([color.x, color.y, color.z, dr.select(covered, mi.Float(1), 0)])
 
-    return seen(edges.inside) - seen(edges.outside)
+    return seen(inside) - seen(outside)
+
+
+def _jump(image_gradient: mi.Float, pixel: mi.UInt32, contrast: mi.ArrayXf | None) -> mi.Float:
+    """<dLoss/dI(pixel), c_in - c_out>: what the loss loses where a boundary moves by a pixel."""
+    assert contrast is not None
+    g, c = _pixel(image_gradient, pixel), contrast
+    return dr.fma(g[0], c[0], dr.fma(g[1], c[1], dr.fma(g[2], c[2], g[3] * c[3])))
 
 
 def _pixel(image: mi.Float, index: mi.UInt32) -> mi.ArrayXf:

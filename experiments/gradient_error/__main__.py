@@ -5,7 +5,8 @@
     python -m experiments.gradient_error --sizes             # spot at 64^2 to 512^2 with 1k to 94k triangles
     python -m experiments.gradient_error --plot              # table and pictures from what was measured
 
-References are computed when first asked for and kept under out/gradient_error/cache; ``--force`` makes them anew.
+References are computed when first asked for and kept under out/gradient_error/cache. Scenes that are in the table
+already are skipped; ``--force`` measures them, and ``--new-references`` makes the references, anew.
 """
 
 from __future__ import annotations
@@ -34,14 +35,17 @@ OUT = Path("out/gradient_error")
 REPEATS, TIMED = 6, 8
 
 SETTINGS = {
-    "none": Quality(0.0, 1, 1),
+    "none": Quality(visibility="none"),
+    "pairs": Quality(visibility="pairs"),
+    "pairs, 2 x 2": Quality(samples=4, visibility="pairs"),
+    "pairs, 4 x 4": Quality(samples=16, visibility="pairs"),
     "edges 1, 4 rays": Quality(1.0, 4, 1),
     "edges 2, 4 rays": Quality(2.0, 4, 1),
     "edges 4, 8 rays": Quality(4.0, 8, 1),
     "edges 8, 16 rays, 2 x 2": Quality(8.0, 16, 4),
     "edges 16, 64 rays, 4 x 4": Quality(16.0, 64, 16),
 }
-"""Silhouette points per pixel of silhouette, rays per pixel that a silhouette crosses, rays in the others."""
+"""Edges: silhouette points per pixel of silhouette, rays per pixel that a silhouette crosses, rays in the others."""
 
 PEERS = [("direct_projective", s) for s in (4, 16, 64)] + [("prb_projective", 16)]
 SIZES = [("spot-1k", 64), ("spot-1k", 128), ("spot-1k", 256), ("spot-1k", 512), ("spot-6k", 256), ("spot-94k", 256)]
@@ -75,6 +79,7 @@ def main() -> None:
     parser.add_argument("--no-peers", action="store_true")
     parser.add_argument("--sizes", action="store_true")
     parser.add_argument("--force", action="store_true")
+    parser.add_argument("--new-references", action="store_true")
     parser.add_argument("--plot", action="store_true")
     arguments = parser.parse_args()
     name = (
@@ -83,10 +88,14 @@ def main() -> None:
     if not arguments.plot:
         backend.select("cpu")
         mitsuba_peer.register()
+        path = OUT / f"{name}.csv"
         cases = SIZES if arguments.sizes else [(s, 128) for s in arguments.scenes]
         for scene, resolution in cases:
-            rows = measure(scene, resolution, arguments.loss, not arguments.no_peers, arguments.force)
-            keep(OUT / f"{name}.csv", rows)
+            wanted = [*SETTINGS, *(() if arguments.no_peers else map(peer_name, PEERS))]
+            if not arguments.force and not arguments.new_references and measured(path, scene, resolution, wanted):
+                continue
+            rows = measure(scene, resolution, arguments.loss, not arguments.no_peers, arguments.new_references)
+            keep(path, rows)
     draw(OUT)
 
 
@@ -119,10 +128,25 @@ def measure(scene: str, resolution: int, loss: str, peers: bool, force: bool) ->
         add(name, lambda seed, q=quality: ours(q, seed), times[name], REPEATS)
     for integrator, samples in PEERS if peers else ():
         peer = Peer(problem, reference.target, loss, integrator)
-        name = f"{integrator}, {samples} spp"
+        name = peer_name((integrator, samples))
         took = milliseconds_of({name: lambda s, p=peer, n=samples: p.device(n, s)}, 3)[name]
         add(name, lambda seed, p=peer, n=samples: p(n, seed), took, 3)
     return rows
+
+
+def peer_name(peer: tuple[str, int]) -> str:
+    return f"{peer[0]}, {peer[1]} spp"
+
+
+def measured(path: Path, scene: str, resolution: int, estimators: list[str]) -> bool:
+    """Are all of these in the table already?"""
+    if not path.exists():
+        return False
+    with path.open() as file:
+        there = {
+            r["estimator"] for r in csv.DictReader(file) if (r["scene"], r["resolution"]) == (scene, str(resolution))
+        }
+    return there.issuperset(estimators)
 
 
 def errors(gradients: np.ndarray, reference: Truth) -> tuple:

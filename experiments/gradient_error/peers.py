@@ -24,6 +24,8 @@ class Peer:
             "metalness": {"type": "uniform", "value": problem.metalness},
         }
         views = problem.views
+        # both sides reflect: open meshes show their backs
+        bsdf = {"type": "twosided", "nested": bsdf}
         mesh = mitsuba_peer.mesh("mesh", problem.positions, problem.faces, bsdf, vertex_color=problem.colors)
         scene = {
             "type": "scene",

@@ -212,11 +212,12 @@ def _spot(subdivisions: int) -> Shape:
     if subdivisions < 0:
         p, f = decimate(p, f, 1400, None)
     for _ in range(subdivisions):
-        p, f = _split(p, f)
+        p, f = split(p, f)
     return p, f, (0.8, 0.3, -1)
 
 
-def _split(p: NDArray, f: NDArray) -> tuple[NDArray, NDArray]:
+def split(p: NDArray, f: NDArray) -> tuple[NDArray, NDArray]:
+    """Each triangle in four, at the middles of its edges."""
     pairs = np.sort(np.concatenate([f[:, [0, 1]], f[:, [1, 2]], f[:, [2, 0]]]), axis=1)
     unique, place = np.unique(pairs, axis=0, return_inverse=True)
     m = place.reshape(3, -1) + len(p)

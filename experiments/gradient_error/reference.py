@@ -15,6 +15,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter
 
 from appearance_opt.latent import mesh_ops
 from appearance_opt.render import brdf, deferred, material, rays, surface, upload
@@ -23,9 +24,12 @@ from appearance_opt.render.rays import MISS
 from experiments.gradient_error.problems import BACKGROUND, Problem, smooth_fields
 
 CACHE = Path("out/gradient_error/cache")
-FIELDS = 20
+FIELDS = 12
 VERTICES = 20
 FIELD_SAMPLES, TARGET_SAMPLES = 128, 1024
+"""At 128 squared pixels; at others so many that a row of pixels has as many: what a silhouette sweeps over, and so the
+noise of a difference, grows with its length in pixels."""
+
 VERTEX_SAMPLES = (256, 1024)
 """Least and most; in between as many as VERTEX_RAYS rays allow."""
 
@@ -147,10 +151,12 @@ def _fingerprint(problem: Problem) -> bytes:
 def _compute(problem: Problem, loss: str) -> Truth:
     everything = np.arange(problem.resolution**2)
     view = Supersampler(problem, problem.target_positions, problem.target_colors)
-    target = view.image(everything, TARGET_SAMPLES, 7)
+    target = view.image(everything, round(TARGET_SAMPLES * 128 / problem.resolution), 7)
     view = Supersampler(problem, problem.positions, problem.colors)
     step = problem.step * problem.pixel_size
     finer = round(0.1 / problem.step)
+    field_samples = round(finer * FIELD_SAMPLES * 128 / problem.resolution)
+    near = _near(view)
     scale = 1 / (3 * problem.resolution**2)
     start = problem.positions.astype(np.float64)
 
@@ -163,7 +169,7 @@ def _compute(problem: Problem, loss: str) -> Truth:
         return (values[:, 0] - values[:, 1]) / (2 * step) * scale
 
     fields = smooth_fields(problem.positions, FIELDS, 1).astype(np.float32)
-    by_field = np.stack([difference(f, everything, finer * FIELD_SAMPLES) for f in fields], axis=1)
+    by_field = np.stack([difference(f, near, field_samples) for f in fields], axis=1)
     vertices = _vertices_to_test(problem, view)
     by_vertex = np.zeros((2, len(vertices), 3))
     reach = _reach(problem, vertices)
@@ -174,6 +180,14 @@ def _compute(problem: Problem, loss: str) -> Truth:
             samples = finer * int(np.clip(VERTEX_RAYS / max(len(reach[k]), 1), *VERTEX_SAMPLES))
             by_vertex[:, k, axis] = difference(change, reach[k], samples) if len(reach[k]) else 0
     return Truth(target.astype(np.float32), fields, by_field, vertices, by_vertex)
+
+
+def _near(view: Supersampler) -> NDArray[np.int64]:
+    """The pixels that see the object, and those up to three pixels away: no other changes with it."""
+    n = view.problem.resolution
+    rgb = view.image(np.arange(n * n), 16, 0)
+    seen = np.abs(rgb - np.array(BACKGROUND)).max(1) > 1e-6
+    return np.flatnonzero(maximum_filter(seen.reshape(n, n), 7))
 
 
 def _vertices_to_test(problem: Problem, view: Supersampler) -> NDArray[np.int64]:

@@ -1,0 +1,40 @@
+"""Lists of camera rays with their shares of the pixels."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from appearance_opt.render.rays import Samples
+
+
+@dataclass
+class Weighted:
+    """Covered camera rays, the ``pixel`` of each and its ``weight`` there (None: one), and their ``width`` in
+    pixels, which selects mip levels."""
+
+    samples: Samples
+    pixel: mi.UInt32
+    weight: mi.Float | None
+    width: mi.Float
+
+
+def concat(parts: list[Samples]) -> Samples:
+    """Lists of samples one after the other."""
+    if len(parts) == 1:
+        return parts[0]
+    return Samples(*(joined([getattr(p, f) for p in parts]) for f in ("view", "x", "y", "triangle")))
+
+
+def joined(parts: list[mi.Float]) -> mi.Float:
+    """Arrays one after the other. ``dr.concat`` would write their widths, which change every step, into the
+    kernel and so compile one every step."""
+    out = dr.empty(type(parts[0]), sum(dr.width(p) for p in parts))
+    offset = 0
+    for part in parts:
+        index = dr.arange(mi.UInt32, dr.width(part)) + dr.opaque(mi.UInt32, offset)
+        dr.scatter(out, part, index, mode=dr.ReduceMode.Permute)
+        offset += dr.width(part)
+    return out

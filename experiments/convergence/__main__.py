@@ -1,0 +1,98 @@
+"""Which visibility estimator brings a whole fit further in the same time?
+
+    python -m experiments.convergence                       # 3 cases x 6 estimators, 25 s each: about 10 minutes
+    python -m experiments.convergence --rows sphere decimated:pairs --seconds 5 --out out/try
+    python -m experiments.convergence --plot                # picture and tables from what was measured
+
+Each fit is one row of out/convergence/curves.csv per look at the held-out views; a rerun skips fits that are there.
+Images of the reference are rendered, and kernels compiled, before the clock starts.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import gc
+from dataclasses import replace
+from pathlib import Path
+
+from appearance_opt import backend
+from appearance_opt.fit.loop import fit
+from appearance_opt.render.gradient import Quality
+from experiments.convergence.cases import Case, make_case, names
+from experiments.convergence.plot import draw
+
+OUT = Path("out/convergence")
+ESTIMATORS = {
+    "none": Quality(visibility="none"),
+    "edges 1, 4 rays": Quality(1.0, 4),
+    "edges 1, 8 rays": Quality(1.0, 8),
+    "edges 4, 8 rays": Quality(4.0, 8),
+    "pairs": Quality(visibility="pairs"),
+    "pairs, 2 x 2": Quality(samples=4, visibility="pairs"),
+}
+FIELDS = ("case", "estimator", "seed", "budget", "seconds", "step", "psnr")
+LOOK = 1 / 12
+"""Part of a fit between two looks at the held-out views; their time counts for all alike."""
+
+WARM_UP = 4
+"""Steps of a fit that is thrown away: kernels are compiled in the first ones."""
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--rows", nargs="*", default=names(), help="case, or case:estimator")
+    parser.add_argument("--seconds", type=float, default=25.0, help="of each fit")
+    parser.add_argument("--seeds", type=int, default=1)
+    parser.add_argument("--out", type=Path, default=OUT)
+    parser.add_argument("--plot", action="store_true")
+    arguments = parser.parse_args()
+    path = arguments.out / "curves.csv"
+    if not arguments.plot:
+        backend.select("cpu")
+        for seed in range(arguments.seeds):
+            for name in names():
+                wanted = [e for e in ESTIMATORS if name in arguments.rows or f"{name}:{e}" in arguments.rows]
+                there = {(r["case"], r["estimator"], int(r["seed"])) for r in rows_of(path)}
+                missing = [e for e in wanted if (name, e, seed) not in there]
+                if missing:
+                    run(make_case(name, seed), missing, seed, arguments.seconds, path)
+    draw(path)
+
+
+def run(case: Case, estimators: list[str], seed: int, seconds: float, path: Path) -> None:
+    """Fit one case with each of the estimators; each curve is kept as soon as it is complete."""
+    for name in estimators:
+        options = replace(case.options, quality=ESTIMATORS[name], validate_every=LOOK)
+        fit(case.make(), case.pool, case.validation, replace(options, steps=WARM_UP))
+        result = fit(case.make(), case.pool, case.validation, replace(options, seconds=seconds))
+        rows = [(case.name, name, seed, seconds, p.seconds, p.step, p.psnr) for p in result.curve]
+        keep(path, rows)
+        last = result.curve[-1]
+        print(f"{case.name:10} {name:18} seed {seed}: {last.step:5} steps, {last.psnr:.2f} dB", flush=True)
+        gc.collect()
+
+
+def rows_of(path: Path) -> list[dict[str, str]]:
+    """What was measured so far."""
+    if not path.exists():
+        return []
+    with path.open() as file:
+        return list(csv.DictReader(file))
+
+
+def keep(path: Path, rows: list[tuple]) -> None:
+    """Append a curve to the table (rewritten under another name, so that it is never half there)."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    every = [tuple(r[f] for f in FIELDS) for r in rows_of(path)]
+    every += [tuple(f"{v:.4f}" if isinstance(v, float) else v for v in r) for r in rows]
+    temporary = path.with_suffix(".partial")
+    with temporary.open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(FIELDS)
+        writer.writerows(every)
+    temporary.rename(path)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,126 @@
+"""What is fitted: a reference, a start that is wrong in its own way, and how a fit would treat it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from appearance_opt.asset import load
+from appearance_opt.config import simplify_options
+from appearance_opt.fit.loop import FitOptions
+from appearance_opt.fit.model import Model, Rates
+from appearance_opt.fit.validation import Validation
+from appearance_opt.initial.sphere import random_maps, sphere
+from appearance_opt.jobs import growth
+from appearance_opt.jobs.fitting import POOL_SAMPLES, VALIDATION_VIEWS, effort, point_width
+from appearance_opt.jobs.simplify import in_frame, support
+from appearance_opt.jobs.start import Start, make_start
+from appearance_opt.reference.mesh import MeshReference
+from appearance_opt.reference.pool import ReferencePool
+from appearance_opt.views import ViewSampler, framing
+
+ASSETS = Path(__file__).resolve().parents[3] / "shared" / "assets"
+SPOT, HELMET = ASSETS / "spot" / "spot.obj", ASSETS / "flight_helmet" / "FlightHelmet.gltf"
+TEXTURE = 512
+LOOKED_AT = 128
+"""Resolution of the held-out views: 9 rays in each pixel."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """``make`` returns a fresh model at its start; ``pool`` holds all its images already; ``options`` lack the time."""
+
+    name: str
+    make: Callable[[], Model]
+    pool: ReferencePool
+    validation: Validation
+    options: FitOptions
+
+
+def names() -> list[str]:
+    return ["sphere", "decimated", "sub-pixel"]
+
+
+def make_case(name: str, seed: int) -> Case:
+    """The case of that name, its reference rendered. ``seed``: of views, backgrounds and random maps."""
+    reference, sampler = _reference(SPOT if name == "sphere" else HELMET, seed)
+    case = {"sphere": _from_sphere, "decimated": _decimated, "sub-pixel": _sub_pixel}[name](reference, sampler, seed)
+    for group in range(case.pool.capacity // case.pool.batch):
+        case.pool.draw(group)
+    return case
+
+
+def _reference(path: Path, seed: int) -> tuple[MeshReference, ViewSampler]:
+    asset = load(path)
+    frame = framing(np.concatenate([m.positions for m in asset.meshes]))
+    reference = MeshReference(in_frame(asset, *frame))
+    return reference, ViewSampler((0.0, 0.0, 0.0), 1.0, seed, hull=support(reference.merged.positions))
+
+
+def _validation(reference: MeshReference, sampler: ViewSampler) -> Validation:
+    return Validation(reference, sampler.held_out(1).draw(0, VALIDATION_VIEWS), LOOKED_AT)
+
+
+def _from_sphere(reference: MeshReference, sampler: ViewSampler, seed: int) -> Case:
+    """A sphere of 4,212 triangles becomes spot, with the preconditioned steps of ``jobs.growth``."""
+    mesh = sphere(growth.OVERSAMPLING * 1404, sampler.centre, 0.6 * sampler.radius, growth.TEXTURE)
+    maps = random_maps(growth.TEXTURE, seed, True)
+
+    def make() -> Model:
+        model = Model(mesh, maps, frozenset(("shape", "normal", "material")), growth.RATES)
+        model.precondition(len(mesh.faces) / growth.TRIANGLES_PER_STRENGTH, growth.RATES.position)
+        return model
+
+    pool = ReferencePool(
+        reference, sampler, growth.POOL, growth.VIEWS, growth.RESOLUTION, growth.POOL_SAMPLES, growth.POINT_WIDTH
+    )
+    options = FitOptions(laplacian=0.0, decay=1.0, seed=seed)
+    return Case("sphere", make, pool, _validation(reference, sampler), options)
+
+
+def _decimated(reference: MeshReference, sampler: ViewSampler, seed: int) -> Case:
+    """flight_helmet with 1,367 triangles, 4 views of 256^2 pixels: the usual fit."""
+    return _from_mesh("decimated", reference, sampler, seed, 1367, 256, 4, None)
+
+
+def _sub_pixel(reference: MeshReference, sampler: ViewSampler, seed: int) -> Case:
+    """flight_helmet with 9,000 triangles on 64^2 pixels: two thirds of a pixel each. Bent by waves of 2 % of the
+    object's radius, for a good start has no shape to find."""
+    return _from_mesh("sub-pixel", reference, sampler, seed, 9000, 64, 16, 0.02)
+
+
+def _from_mesh(
+    name: str,
+    reference: MeshReference,
+    sampler: ViewSampler,
+    seed: int,
+    triangles: int,
+    resolution: int,
+    views: int,
+    bend: float | None,
+) -> Case:
+    options = simplify_options("default", triangles=triangles, texture_size=TEXTURE, reallocate=0)
+    start = make_start(reference, options, sampler, triangles)
+    if bend is not None:
+        start = _bent(start, bend)
+    pool = ReferencePool(reference, sampler, 320, views, resolution, POOL_SAMPLES, point_width(resolution, TEXTURE))
+    validation = _validation(reference, sampler)
+
+    def fresh(rates: Rates) -> Model:
+        return Model(start.mesh, start.maps, frozenset(("shape", "normal", "material")), rates)
+
+    _, rates = effort(validation.psnr(fresh(Rates())), True)
+    # a bent start must not be held in its shape
+    fit_options = FitOptions(laplacian=options.laplacian if bend is None else 0.0, seed=seed)
+    return Case(name, lambda: fresh(rates), pool, validation, fit_options)
+
+
+def _bent(start: Start, amount: float) -> Start:
+    """The same start under a smooth deformation: a plane wave along each axis."""
+    p = start.mesh.positions.astype(np.float64)
+    waves: NDArray = np.sin(p @ np.array([[4.1, 1.9, 0.6], [1.1, 3.7, 2.2], [2.5, 0.8, 4.4]]).T + [0.3, 1.7, 2.9])
+    return replace(start, mesh=replace(start.mesh, positions=(p + amount * waves).astype(np.float32)))
