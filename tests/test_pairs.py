@@ -21,9 +21,10 @@ from appearance_opt.render.gradient import Frame, Quality
 from appearance_opt.render.silhouette import edge_list, walkable
 from appearance_opt.render.surface import Surface
 from appearance_opt.views import Views, ViewSampler
+from experiments.gradient_error.area import ball
 from experiments.gradient_error.estimators import Ours
 from experiments.gradient_error.metrics import error_of
-from experiments.gradient_error.problems import make_problem, split
+from experiments.gradient_error.problems import make_problem
 from experiments.gradient_error.reference import Supersampler, pixel_losses
 from tests.test_gradients import flat_maps, make_inputs, make_model
 
@@ -33,17 +34,6 @@ PAIRS = Quality(visibility="pairs")
 
 def white(mesh: LatentMesh) -> Model:
     return Model(mesh, flat_maps(16), frozenset(("shape",)), Rates())
-
-
-def ball(splits: int) -> LatentMesh:
-    """A sphere of 1,200 triangles, split in four ``splits`` times, without texture coordinates."""
-    mesh = sphere(1200, (0.0, 0.0, 0.0), 0.7, 16)
-    p, f = mesh.positions.astype(np.float64), mesh.faces
-    for _ in range(splits):
-        p, f = split(p, f)
-        p *= 0.7 / np.linalg.norm(p, axis=1, keepdims=True)
-    f = f.astype(np.int32)
-    return LatentMesh(p.astype(np.float32), f, np.arange(len(p), dtype=np.int32), f, np.zeros((len(p), 2), np.float32))
 
 
 def two_balls() -> LatentMesh:

@@ -2,7 +2,8 @@
 
     python -m experiments.gradient_error                    # all scenes at 128^2: out/gradient_error/vertices.csv
     python -m experiments.gradient_error --scenes ball torus --no-peers
-    python -m experiments.gradient_error --sizes             # spot at 64^2 to 512^2 with 1k to 94k triangles
+    python -m experiments.gradient_error --sizes             # spot at 64^2 to 512^2 with 1k to 94k triangles: sizes.csv
+    python -m experiments.gradient_error --sizes spot-1k:64 --no-peers
     python -m experiments.gradient_error --plot              # table and pictures from what was measured
 
 References are computed when first asked for and kept under out/gradient_error/cache. Scenes that are in the table
@@ -74,29 +75,32 @@ class Row:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--scenes", nargs="*", default=problem_names())
+    parser.add_argument("--scenes", nargs="*", help="only these; pictures are then left as they are")
     parser.add_argument("--loss", default="log-srgb-l1", choices=("log-srgb-l1", "l2"))
     parser.add_argument("--no-peers", action="store_true")
-    parser.add_argument("--sizes", action="store_true")
+    parser.add_argument("--sizes", nargs="*", metavar="SCENE:RESOLUTION", help="all of them when none is named")
     parser.add_argument("--force", action="store_true")
     parser.add_argument("--new-references", action="store_true")
     parser.add_argument("--plot", action="store_true")
     arguments = parser.parse_args()
-    name = (
-        "sizes" if arguments.sizes else "vertices" if arguments.loss == "log-srgb-l1" else f"vertices_{arguments.loss}"
-    )
+    name = "vertices" if arguments.sizes is None else "sizes"
+    if arguments.loss != "log-srgb-l1":
+        name += f"_{arguments.loss}"
     if not arguments.plot:
         backend.select("cpu")
         mitsuba_peer.register()
         path = OUT / f"{name}.csv"
-        cases = SIZES if arguments.sizes else [(s, 128) for s in arguments.scenes]
+        cases = [(s, 128) for s in arguments.scenes or problem_names()]
+        if arguments.sizes is not None:
+            cases = [(s, int(r)) for s, r in (c.split(":") for c in arguments.sizes)] or SIZES
         for scene, resolution in cases:
             wanted = [*SETTINGS, *(() if arguments.no_peers else map(peer_name, PEERS))]
             if not arguments.force and not arguments.new_references and measured(path, scene, resolution, wanted):
                 continue
             rows = measure(scene, resolution, arguments.loss, not arguments.no_peers, arguments.new_references)
             keep(path, rows)
-    draw(OUT)
+    if not arguments.scenes and not arguments.sizes:
+        draw(OUT)
 
 
 def measure(scene: str, resolution: int, loss: str, peers: bool, force: bool) -> list[Row]:
@@ -108,8 +112,7 @@ def measure(scene: str, resolution: int, loss: str, peers: bool, force: bool) ->
     ours = Ours(problem, reference.target, loss)
     rows: list[Row] = []
 
-    def add(name: str, gradient: Callable[[int], np.ndarray], milliseconds: float, repeats: int) -> None:
-        g = np.stack([gradient(seed) for seed in range(repeats)])
+    def add(name: str, g: np.ndarray, milliseconds: float) -> None:
         fields, vertices = errors(g, reference)
         base = rows[0].milliseconds if rows else milliseconds
         rows.append(
@@ -125,12 +128,12 @@ def measure(scene: str, resolution: int, loss: str, peers: bool, force: bool) ->
 
     times = milliseconds_of({n: lambda s, q=q: ours.device(q, s) for n, q in SETTINGS.items()}, TIMED)
     for name, quality in SETTINGS.items():
-        add(name, lambda seed, q=quality: ours(q, seed), times[name], REPEATS)
+        add(name, np.stack([ours(quality, seed) for seed in range(REPEATS)]), times[name])
     for integrator, samples in PEERS if peers else ():
         peer = Peer(problem, reference.target, loss, integrator)
         name = peer_name((integrator, samples))
-        took = milliseconds_of({name: lambda s, p=peer, n=samples: p.device(n, s)}, 3)[name]
-        add(name, lambda seed, p=peer, n=samples: p(n, seed), took, 3)
+        peer.device(1, 0)  # compiles
+        add(name, *timed(lambda s, p=peer, n=samples: p(n, s), 3 if resolution <= 128 else 2))
     return rows
 
 
@@ -167,6 +170,17 @@ def milliseconds_of(work: dict[str, Callable[[int], object]], repeats: int) -> d
             dr.sync_thread()
             times[name].append(1e3 * (time.perf_counter() - began))
     return {name: min(t[1:]) for name, t in times.items()}
+
+
+def timed(gradient: Callable[[int], np.ndarray], repeats: int) -> tuple[np.ndarray, float]:
+    """Repetitions (R, V, 3), and the smallest time of one in milliseconds: for what is too slow to be run for its time
+    alone."""
+    results, times = [], []
+    for seed in range(repeats):
+        began = time.perf_counter()
+        results.append(gradient(seed))
+        times.append(1e3 * (time.perf_counter() - began))
+    return np.stack(results), min(times)
 
 
 def keep(path: Path, rows: list[Row]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import shutil
 from pathlib import Path
 
 import matplotlib
@@ -11,9 +12,9 @@ IMAGES = Path("docs/images")
 
 
 def draw(folder: Path) -> None:
-    """Markdown tables beside the CSV files in ``folder``, pictures into docs/images."""
+    """Markdown tables beside the CSV files in ``folder``, pictures and the CSV files into docs/images."""
     matplotlib.use("agg")
-    for name in ("vertices", "vertices_l2", "sizes"):
+    for name in ("vertices", "vertices_l2", "sizes", "sizes_l2"):
         path = folder / f"{name}.csv"
         if not path.exists():
             continue
@@ -21,6 +22,7 @@ def draw(folder: Path) -> None:
             rows = list(csv.DictReader(file))
         path.with_suffix(".md").write_text(table(rows))
         error_against_time(rows, IMAGES / f"gradient_error_{name}.png")
+        shutil.copyfile(path, IMAGES / f"gradient_error_{name}.csv")
 
 
 def table(rows: list[dict[str, str]]) -> str:
