@@ -13,6 +13,7 @@ from appearance_opt import backend
 from experiments import mitsuba_peer
 
 ASSETS = Path(__file__).resolve().parents[3] / "shared" / "assets"
+WITH_NORMAL_MAPS = "flight_helmet/*.gltf"
 MODELS = ("spot/spot.obj", "teapot/*.obj", "flight_helmet/*.gltf", "elephant/*.obj")
 
 
@@ -72,10 +73,11 @@ def image_table() -> None:
 
     mitsuba_peer.register()
     print("\n| model | PSNR | pixels that differ by more than 2 / 255 |\n|---|---|---|")
-    for pattern in MODELS:
+    for pattern, normal_maps in [*((m, False) for m in MODELS), (WITH_NORMAL_MAPS, True)]:
         for path in sorted(ASSETS.glob(pattern))[:1]:
-            result = compare(path)
-            print(f"| {path.stem} | {result.psnr:.1f} dB | {100 * result.differing:.2f} % |")
+            result = compare(path, normal_maps=normal_maps)
+            name = f"{path.stem}, with normal maps" if normal_maps else path.stem
+            print(f"| {name} | {result.psnr:.1f} dB | {100 * result.differing:.2f} % |")
 
 
 if __name__ == "__main__":

@@ -13,6 +13,7 @@ from appearance_opt.asset import Asset, load
 from appearance_opt.asset.types import Mesh, Texture, linear_to_srgb
 from appearance_opt.jobs.simplify import in_frame
 from appearance_opt.reference.mesh import MeshReference
+from appearance_opt.render.deferred import Grid
 from appearance_opt.views import ViewSampler, framing
 from experiments import mitsuba_peer
 
@@ -29,28 +30,55 @@ class Comparison:
     theirs: NDArray[np.float32]
 
 
-def compare(path: Path, resolution: int = 256) -> Comparison:
-    """One view of a model, lit from the eye (Mitsuba traces shadows), normal maps left out (Mitsuba builds their
-    frames from the texture coordinates of each triangle, glTF from MikkTSpace's tangents)."""
+def compare(path: Path, resolution: int = 256, normal_maps: bool = False) -> Comparison:
+    """One view of a model, lit from the eye (Mitsuba traces shadows). ``normal_maps``: with them, by Mitsuba's own
+    BSDF ``normalmap``, which builds frames from the texture coordinates of each triangle, where glTF has MikkTSpace's
+    smooth tangents. Its frames are right-handed: faces with mirrored coordinates get a map with the green turned
+    over."""
     asset = load(path)
     frame = framing(np.concatenate([m.positions for m in asset.meshes]))
-    asset = _plain(in_frame(asset, *frame))
+    asset = in_frame(asset, *frame)
+    if not normal_maps:
+        asset = _plain(asset)
     views = ViewSampler((0.0, 0.0, 0.0), 1.0, seed=3, light="headlight").draw(0, 1)
     # textures unfiltered on both sides: the samples are the filter
-    ours = MeshReference(asset)._render(views, resolution, SAMPLES, 1e-3)[0, ..., :3]
+    flat = MeshReference(asset).render_device(views.records(), Grid(1, resolution), SAMPLES, 1e-3)
+    ours = np.array(flat).reshape(resolution, resolution, 4)[..., :3]
     scene = {"type": "scene", "light": mitsuba_peer.light(views, 0)}
     for k, mesh in enumerate(asset.meshes):
-        normals = mesh.normals
-        scene[f"mesh{k}"] = mitsuba_peer.mesh(
-            f"mesh{k}", mesh.positions, mesh.faces, _bsdf(mesh), **({} if normals is None else {"normals": normals}),
-            **({} if mesh.uvs is None else {"uvs": mesh.uvs}),
-        )  # fmt: skip
+        attributes = {"normals": mesh.normals, "uvs": mesh.uvs}
+        attributes = {n: a for n, a in attributes.items() if a is not None}
+        for part, (faces, mirrored) in enumerate(_by_handedness(mesh)):
+            bsdf = _bsdf(mesh) if mesh.material.normal_texture is None else _mapped(mesh, mirrored)
+            name = f"mesh{k}_{part}"
+            scene[name] = mitsuba_peer.mesh(name, mesh.positions, faces, bsdf, **attributes)
     integrator = mi.load_dict({"type": "direct"})
     sensor = mitsuba_peer.sensor(views, 0, resolution)
     theirs = np.array(mi.render(mi.load_dict(scene), sensor=sensor, integrator=integrator, spp=SAMPLES))
     a, b = (linear_to_srgb(np.clip(i, 0, 1).astype(np.float32)) for i in (ours, theirs))
     differing = float(np.mean(np.abs(a - b).max(-1) > 2 / 255))
     return Comparison(float(-10 * np.log10(np.mean((a - b) ** 2))), differing, a, b)
+
+
+def _by_handedness(mesh: Mesh) -> list[tuple[NDArray, bool]]:
+    """(faces, are their texture coordinates mirrored?): one part without a normal map, else up to two."""
+    if mesh.material.normal_texture is None or mesh.uvs is None:
+        return [(mesh.faces, False)]
+    uv = mesh.uvs[mesh.faces].astype(np.float64)
+    a, b = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
+    # v grows downward: a plain mapping turns the other way round
+    mirrored = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0] > 0
+    return [(mesh.faces[mirrored == side], side) for side in (False, True) if (mirrored == side).any()]
+
+
+def _mapped(mesh: Mesh, mirrored: bool) -> dict:
+    """The BRDF under Mitsuba's normal map."""
+    texture = mesh.material.normal_texture
+    assert texture is not None
+    pixels = texture.linear()[..., :3].copy()
+    if mirrored:
+        pixels[..., 1] = 1 - pixels[..., 1]
+    return {"type": "normalmap", "normalmap": _bitmap(pixels, texture), "nested": _bsdf(mesh)}
 
 
 def _plain(asset: Asset) -> Asset:
