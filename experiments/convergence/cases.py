@@ -88,7 +88,7 @@ def _decimated(reference: MeshReference, sampler: ViewSampler, seed: int) -> Cas
 
 
 def _sub_pixel(reference: MeshReference, sampler: ViewSampler, seed: int) -> Case:
-    """flight_helmet with 9,000 triangles on 64^2 pixels: two thirds of a pixel each. Bent by waves of 2 % of the
+    """flight_helmet with 9,000 triangles on 64^2 pixels: smaller than a pixel each. Bent by waves of 2 % of the
     object's radius, for a good start has no shape to find."""
     return _from_mesh("sub-pixel", reference, sampler, seed, 9000, 64, 16, 0.02)
 
