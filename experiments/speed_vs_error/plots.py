@@ -98,8 +98,9 @@ def _levers(rows: list[CurveRow], path: Path) -> None:
         axes[0].scatter(np.maximum(decibel, -LARGEST), y + shift, s=14, color=colour, label=scene)
         axes[1].scatter(np.minimum(ratio, 2.0), y + shift, s=14, color=colour)
     axes[0].set_xlim(-LARGEST - 0.1, None)
-    noise = max((abs(f[0]) for f in (against_default(rows, s, SEED) for s in scenes) if f is not None), default=0.0)
-    axes[0].axvspan(-noise, noise, color="#eeeeee", zorder=0)
+    chance = [abs(f[0]) for f in (against_default(rows, s, SEED) for s in scenes) if f is not None]
+    if chance:
+        axes[0].axvspan(-float(np.median(chance)), float(np.median(chance)), color="#eeeeee", zorder=0)
     for axis, zero in zip(axes, (0.0, 1.0), strict=True):
         axis.axvline(zero, color="black", linewidth=0.8)
         axis.grid(alpha=0.25, linewidth=0.4)
@@ -108,7 +109,7 @@ def _levers(rows: list[CurveRow], path: Path) -> None:
     axes[0].set_ylim(len(names) - 0.5, -0.5)
     axes[0].set_xlabel(f"dB above the default at equal time (cut at -{LARGEST:g})", fontsize=8)
     axes[1].set_xlabel("FLIP over the default's at equal time (cut at 2)", fontsize=8)
-    axes[0].legend(fontsize=7, loc="lower left")
+    figure.legend(fontsize=7, loc="outside upper center", ncols=len(scenes))
     _save(figure, path)
 
 
@@ -162,6 +163,6 @@ def _seconds_axis(axis) -> None:
 def _save(figure, path: Path) -> None:
     import matplotlib.pyplot as plt
 
-    figure.tight_layout()
+    figure.set_layout_engine("constrained")
     figure.savefig(path, dpi=110)
     plt.close(figure)
