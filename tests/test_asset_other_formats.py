@@ -137,6 +137,12 @@ def test_catmull_clark_of_a_cube_tends_to_its_known_limit() -> None:
     np.testing.assert_allclose(sorted(np.abs(values[8])), [0, 0.75, 0.75], atol=1e-12)
 
 
+def test_folders_may_be_links(assets_dir: Path, tmp_path: Path) -> None:
+    (tmp_path / "linked").symlink_to(assets_dir / "chess_king")
+    asset = load(tmp_path / "linked" / "King.usd", refine=0, variants={"shadingVariant": "White"})
+    assert asset.meshes[0].material.normal_texture is not None
+
+
 def test_a_chess_piece_reads_as_refined(assets_dir: Path) -> None:
     path = assets_dir / "chess_king" / "King.usd"
     asset = load(path, variants={"shadingVariant": "White"})

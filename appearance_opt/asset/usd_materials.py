@@ -107,7 +107,7 @@ class MaterialReader:
             for dependency in layer.GetCompositionAssetDependencies():
                 if not dependency.endswith(".mtlx") or not layer.realPath:
                     continue
-                file = resolve(str((Path(layer.realPath).parent / dependency).relative_to(root)), self.path)
+                file = resolve(str((Path(layer.realPath).resolve().parent / dependency).relative_to(root)), self.path)
                 found = load_materialx(file, name, self.missing)
                 if found is not None:
                     self.notes.append(f"material '{name}' read from {file.name}: subsurface and coat ignored")
