@@ -24,9 +24,10 @@ NO_AREA, NO_SURFACE = 1e-12, 1e-6
 """UV area (fraction of the square) that counts as none, and the share of the surface that such triangles
 may have: slivers without area in space may well have none in the atlas."""
 
-OVERLAP_SIZE, OVERLAP_MARGIN, OVERLAP_SHARE = 2048, 0.05, 1e-4
+OVERLAP_SIZE, OVERLAP_MARGIN, OVERLAP_SHARE = 2048, 0.05, 1e-3
 """Overlaps are looked for on a grid of this many points a side; a point counts for a triangle if it lies
-this far inside, in grid cells; fewer overlapping points than this share of the covered ones are rounding."""
+this far inside, in grid cells; fewer overlapping points than this share of the covered ones are rounding, or the
+folded slivers that automatic atlases leave (1.5e-4 in xatlas's of the demo's 8,999 triangles)."""
 
 MENDING = "use --unwrap to make a new atlas"
 
