@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import drjit as dr
@@ -44,15 +45,19 @@ class TexelPoints:
     """
 
     def __init__(self, mesh: LatentMesh, size: int, samples: int = 1) -> None:
-        self.size, self.samples = size, samples
+        self.mesh, self.size, self.samples = mesh, size, samples
         self.rows = max(1, min(size, BAND // size))
         positions = np.ascontiguousarray(mesh.positions, np.float32)
         self.surface = LatentTopology(mesh, tangents=True).surface(mi.Float(positions.ravel()))
         self.atlas = atlas_scene(mesh)
-        self.scene = upload.scene_of(positions, mesh.faces)
         self._directions: mi.Float | None = None
         if mesh.normals is not None:
             self._directions = upload.packets(4, vertex_normals(positions, mesh.faces))
+
+    @cached_property
+    def scene(self) -> mi.Scene:
+        """The mesh itself, for rays; made when first asked for."""
+        return upload.scene_of(self.mesh.positions, self.mesh.faces)
 
     def band(self, row: int, dx: float, dy: float) -> Points | None:
         """Points under (dx, dy), in texels, of the texels of ``rows`` rows from ``row`` on; None if there

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from appearance_opt.config import with_values
 from appearance_opt.errors import InputError
 from appearance_opt.fit import archive
 from appearance_opt.fit.loop import FitOptions, FitResult, fit
@@ -23,7 +24,6 @@ from appearance_opt.fit.validation import Validation
 from appearance_opt.initial.atlas import unwrap
 from appearance_opt.initial.decimate import decimate
 from appearance_opt.initial.sphere import random_maps, sphere
-from appearance_opt.initial.transfer import transfer
 from appearance_opt.jobs.fitting import VALIDATION_VIEWS, clean_maps
 from appearance_opt.jobs.start import Start, transferred
 from appearance_opt.latent.export import to_asset
@@ -84,7 +84,7 @@ def grown(
 ) -> tuple[Start, bool]:
     """(start, interrupted), grown from a sphere. Only images of the reference are used."""
     texture = min(TEXTURE, options.texture_size)
-    mesh = stretched(sphere(OVERSAMPLING * triangles, (0.0, 0.0, 0.0), 1.0, texture), sampler)
+    mesh = first_shape(triangles, sampler, texture)
     maps = random_maps(texture, options.seed, options.normal_map and "normal" in options.fit)
     model, result = _shaped(reference, sampler, options, mesh, maps, 1.0, effort)
     likeness = to_asset(mesh, model.host_positions(), clean_maps(model, np.zeros((texture, texture), bool)), "grown")
@@ -96,15 +96,15 @@ def grown(
 
 
 def mended(
-    reference: MeshReference, sampler: ViewSampler, options: SimplifyOptions, spoilt: Start, effort: Effort
+    reference: MeshReference, sampler: ViewSampler, options: SimplifyOptions, spoilt: LatentMesh, effort: Effort
 ) -> tuple[Start, bool]:
-    """(start, interrupted): the mesh of a spoilt start moved to where images want it, its triangles kept; atlas and
+    """(start, interrupted): a spoilt mesh moved to where images want it, its triangles kept; atlas and
     maps are made anew. Neighbours move together, so that lost volume comes back and a patch that lies
     off moves as a whole, where steps of single vertices would crumple it."""
-    found = transfer(reference, spoilt.mesh, min(TEXTURE, options.texture_size))
-    maps = {n: v for n, v in found.maps.items() if options.normal_map or not n.startswith("normal")}
-    model, result = _shaped(reference, sampler, options, spoilt.mesh, maps, MENDING, effort)
-    mesh = unwrap(model.host_positions(), spoilt.mesh.faces, options.texture_size)
+    small = with_values(options, texture_size=min(TEXTURE, options.texture_size))
+    maps = transferred(reference, spoilt, small).maps
+    model, result = _shaped(reference, sampler, options, spoilt, maps, MENDING, effort)
+    mesh = unwrap(model.host_positions(), spoilt.faces, options.texture_size)
     return transferred(reference, mesh, options), result.interrupted
 
 
@@ -113,15 +113,15 @@ def _shaped(
     sampler: ViewSampler,
     options: SimplifyOptions,
     mesh: LatentMesh,
-    maps: Mapping[str, NDArray],
+    maps: Mapping[str, NDArray | float],
     pace: float,
     effort: Effort,
 ) -> tuple[Model, FitResult]:
     """A mesh with maps after preconditioned steps, ``pace`` times as large as for a sphere; the model is left at its
     best state."""
     model = Model(mesh, maps, frozenset(options.fit), RATES)
-    strength = len(mesh.faces) / TRIANGLES_PER_STRENGTH
-    model.precondition(strength, pace * POSITION_RATE * strength**0.5)
+    strength, rate = smoothing(len(mesh.faces))
+    model.precondition(strength, pace * rate)
     pool = ReferencePool(reference, sampler, POOL, VIEWS, RESOLUTION, POOL_SAMPLES, POINT_WIDTH)
     validation = Validation(reference, sampler.held_out(1).draw(0, VALIDATION_VIEWS), RESOLUTION)
     fit_options = FitOptions(
@@ -136,6 +136,17 @@ def _shaped(
     result = fit(model, pool, validation, fit_options, effort.progress)
     log.info("shape by preconditioned steps: %d of them, %.2f dB", result.steps, result.curve[-1].psnr)
     return model, result
+
+
+def smoothing(triangles: int) -> tuple[float, float]:
+    """(strength, rate) of the preconditioned steps of a growing mesh."""
+    strength = triangles / TRIANGLES_PER_STRENGTH
+    return strength, POSITION_RATE * strength**0.5
+
+
+def first_shape(triangles: int, sampler: ViewSampler, texture: int) -> LatentMesh:
+    """What grows into a mesh of ``triangles``."""
+    return stretched(sphere(OVERSAMPLING * triangles, (0.0, 0.0, 0.0), 1.0, texture), sampler)
 
 
 def stretched(ball: LatentMesh, sampler: ViewSampler) -> LatentMesh:

@@ -95,13 +95,13 @@ def simplify(
     if result.error is not None:
         raise result.error
     sampler, frame = run.sampler, run.frame
-    # the report uploads what it draws: a heavy reference need not be held twice
     del run
-    backend.release_memory()
 
     def write_report() -> None:
         from appearance_opt.jobs.report import write_simplify_report
 
+        # the report uploads what it draws: a heavy reference need not be held twice
+        backend.release_memory()
         assert report is not None
         write_simplify_report(Path(report), asset, result, sampler, frame, options)
 
@@ -147,7 +147,7 @@ class _Job:
     ) -> None:
         from appearance_opt.jobs.fitting import seconds_left
         from appearance_opt.jobs.growth import grown, mended
-        from appearance_opt.jobs.start import budget, loaded_start, make_start
+        from appearance_opt.jobs.start import budget, loaded_mesh, make_start, transferred
         from appearance_opt.reference.mesh import MeshReference
         from appearance_opt.views import ViewSampler, framing
 
@@ -170,14 +170,13 @@ class _Job:
             left = seconds_left(options, watch, with_report)
             self.start = make_start(self.reference, options, self.sampler, triangles, left)
         else:
-            self.start = loaded_start(
-                Path(options.init), (np.array(self.frame[0]), self.frame[1]), self.reference, options
-            )
+            mesh = loaded_mesh(Path(options.init), self.frame, asset.triangle_count, options)
             if options.relative is False and "shape" in options.fit and not options.displaced:
-                spoilt = self.start
-                self.start = self._shaped(lambda effort: mended(self.reference, self.sampler, options, spoilt, effort))
+                self.start = self._shaped(lambda effort: mended(self.reference, self.sampler, options, mesh, effort))
                 # the shape has been let go of; the mended one is a likeness
                 self.options = with_values(self.options, relative=None)
+            else:
+                self.start = transferred(self.reference, mesh, options)
         self.asset = asset
         watch.lap("start")
 

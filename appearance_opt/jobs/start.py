@@ -172,25 +172,24 @@ def transferred(reference: MeshReference, mesh: LatentMesh, options: SimplifyOpt
     return Start(mesh, {**maps, **displacement}, True, result.covered, options.levels(), finest)
 
 
-def loaded_start(
-    path: Path, to_fit_frame: tuple[NDArray, float], reference: MeshReference, options: SimplifyOptions
-) -> Start:
-    """The mesh of a file as a start: its shape is kept, atlas and maps are made anew. Raises InputError when it
-    has more triangles than were asked for."""
+def loaded_mesh(
+    path: Path, frame: tuple[tuple[float, float, float], float], available: int, options: SimplifyOptions
+) -> LatentMesh:
+    """The mesh of a file, moved to a ``frame`` (centre, scale), with a new atlas. ``available``: triangles of the
+    reference. Raises InputError when it has more triangles than were asked for."""
     from appearance_opt.asset import load
     from appearance_opt.asset.normals import weld
 
     # its own maps are not used: it may lack them
     asset = load(path, refine=options.refine, missing_textures="ignore")
-    most = None if options.triangles is None and options.ratio is None else budget(options, len(reference.merged.faces))
+    most = None if options.triangles is None and options.ratio is None else budget(options, available)
     if most is not None and asset.triangle_count > most:
         raise InputError(f"--init {path}: has {asset.triangle_count} triangles, more than the {most} asked for")
     offsets = np.cumsum([0] + [len(m.positions) for m in asset.meshes[:-1]])
     p = np.concatenate([m.positions for m in asset.meshes]).astype(np.float64)
     f = np.concatenate([m.faces + o for m, o in zip(asset.meshes, offsets, strict=True)])
     first, place = weld(p)
-    centre, scale = to_fit_frame
+    centre, scale = frame
     faces = place[f].astype(np.int32)
     require_memory(len(faces), options)
-    mesh = unwrap((p[first] - centre) / scale, faces, options.texture_size, gutter(len(faces), options))
-    return transferred(reference, mesh, options)
+    return unwrap((p[first] - np.array(centre)) / scale, faces, options.texture_size, gutter(len(faces), options))

@@ -62,14 +62,6 @@ class TexelCodec:
 
     def layer(self, stored: mi.Float) -> TexelLayer:
         """Pyramid of the stored values, ready for the renderer. Not differentiated: see ``pull_back``."""
-        return self.layer_of(self.texels(stored))
-
-    def layer_of(self, texels: mi.Float) -> TexelLayer:
-        """The layer around the ``texels`` of its pyramid."""
-        return TexelLayer(self.channels, self._template.with_texels(texels))
-
-    def texels(self, stored: mi.Float) -> mi.Float:
-        """All levels of the pyramid of the stored values."""
         with dr.suspend_grad():
             level = self.decode(stored)
             levels = [level]
@@ -78,7 +70,7 @@ class TexelCodec:
                 levels.append(level)
             texels = levels[0] if len(levels) == 1 else dr.concat(levels)
             dr.eval(texels)
-        return texels
+        return TexelLayer(self.channels, self._template.with_texels(texels))
 
     def pull_back(self, gradient: mi.Float, stored: mi.Float) -> mi.Float:
         """Gradient for the stored values from the gradient of all levels of the pyramid: each level

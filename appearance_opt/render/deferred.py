@@ -41,6 +41,15 @@ class Grid:
         self.rows = dr.opaque(mi.UInt32, resolution)
         self.view, self.column, self.row = rays.pixel_grid(views, resolution)
         dr.eval(self.view, self.column, self.row)
+        self._finer: dict[int, Grid] = {}
+
+    def finer(self, factor: int) -> Grid:
+        """``factor`` squared points in every pixel, as a grid of their own; made when first asked for."""
+        if factor == 1:
+            return self
+        if factor not in self._finer:
+            self._finer[factor] = Grid(self.views, self.resolution * factor)
+        return self._finer[factor]
 
     @property
     def pixels(self) -> int:

@@ -259,8 +259,7 @@ def _hits(
 ) -> tuple[Samples, mi.Bool]:
     """What the ray at the offset (dx, dy) in every pixel hits, and whether it hits, away from silhouettes."""
     hits = rays.trace(scene, records, view, mi.Float(column) + dx, mi.Float(row) + dy, size)
-    pixel = (view * rows + row) * rows + column
-    return hits, (hits.triangle != MISS) & ~dr.gather(mi.Bool, on_edge, pixel)
+    return hits, (hits.triangle != MISS) & ~dr.gather(mi.Bool, on_edge, pixel_index(hits, rows))
 
 
 def _weighted(parts: list[Samples], weights: list[float] | None, grid: Grid, width_of_one: float) -> Weighted | None:

@@ -99,7 +99,7 @@ def paired_samples(
     are deferred with ``defer``. No gradients. ``edges`` must be ``walkable``; ``run``: see ``freezing``."""
     assert edges.around is not None, "pairs walk over the mesh: use LatentTopology.walkable"
     per_axis = isqrt(quality.samples)
-    fine = _Fine(grid if per_axis == 1 else Grid(grid.views, grid.resolution * per_axis), grid, per_axis)
+    fine = _Fine(grid.finer(per_axis), grid, per_axis)
     s = fine.samples
     hits, depth = run(_middles, scene, records, s.view, s.column, s.row, s.size)
     dr.eval(hits, depth)
