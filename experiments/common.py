@@ -8,8 +8,12 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 if TYPE_CHECKING:
     from collections.abc import Callable
+
+    from appearance_opt.asset.types import Asset
 
 ROOT = Path(__file__).resolve().parents[1]
 JUDGE = ROOT.parent / "shared" / "judge"
@@ -27,6 +31,21 @@ def source_of(asset: str) -> Path:
         path.parent.mkdir(parents=True, exist_ok=True)
         subprocess.run([sys.executable, "-m", "scenes.build", asset, str(path)], check=True, cwd=ROOT)
     return path
+
+
+class Framed:
+    """An asset in the frame of a fit, as a job sees it: ``asset`` moved there, ``frame`` (centre, scale), its
+    ``reference`` and the ``sampler`` of its views."""
+
+    def __init__(self, asset: Asset, seed: int = 0) -> None:
+        from appearance_opt.jobs.simplify import in_frame, support
+        from appearance_opt.reference.mesh import MeshReference
+        from appearance_opt.views import ViewSampler, framing
+
+        self.frame = framing(np.concatenate([m.positions for m in asset.meshes]))
+        self.asset = in_frame(asset, *self.frame)
+        self.reference = MeshReference(self.asset)
+        self.sampler = ViewSampler((0.0, 0.0, 0.0), 1.0, seed, hull=support(self.reference.merged.positions))
 
 
 class Kept:

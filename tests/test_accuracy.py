@@ -20,7 +20,7 @@ from experiments.accuracy import physics, stages, textures
 from experiments.gradient_error.estimators import Ours
 from experiments.gradient_error.metrics import error_of
 from experiments.gradient_error.problems import make_problem, smooth_fields
-from experiments.gradient_error.reference import Supersampler, pixel_losses
+from tests.differences import differences_along
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 4, 7, 8, 16, 64, 256])
@@ -130,16 +130,8 @@ def test_tangents_equal_those_of_mikktspace(name: str) -> None:
 
 def test_vertex_gradients_of_a_triangle_are_those_of_its_box_filtered_image() -> None:
     problem = make_problem("triangle", 64)
-    every = np.arange(64 * 64)
-    target = Supersampler(problem, problem.target_positions, problem.target_colors).image(every, 256, 1)
-    view = Supersampler(problem, problem.positions, problem.colors)
     fields = smooth_fields(problem.positions, 6, 1)
-    step = problem.step * problem.pixel_size
-    truth = np.zeros(len(fields))
-    for k, field in enumerate(fields):
-        for sign in (1, -1):
-            view.move(problem.positions + sign * step * field)
-            truth[k] += sign * pixel_losses("log-srgb-l1", view.image(every, 512, 0), target) / (2 * step * target.size)
+    target, truth = differences_along(problem, fields, 256)
     ours = Ours(problem, target, "log-srgb-l1")
     g = np.stack([ours(Quality(2.0, 4, 1), seed) for seed in range(4)])
     error = error_of(np.einsum("rvc,nvc->rn", g, fields), truth)

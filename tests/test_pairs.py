@@ -25,7 +25,7 @@ from experiments.gradient_error.area import ball
 from experiments.gradient_error.estimators import Ours
 from experiments.gradient_error.metrics import error_of
 from experiments.gradient_error.problems import make_problem
-from experiments.gradient_error.reference import Supersampler, pixel_losses
+from tests.differences import differences_along
 from tests.test_gradients import flat_maps, make_inputs, make_model
 
 SAMPLER = ViewSampler((0.0, 0.0, 0.0), 1.0, seed=5)
@@ -178,17 +178,9 @@ def test_a_step_with_pairs_agrees_with_one_with_edges() -> None:
 def test_surfaces_that_run_into_each_other_move_their_meeting_curve() -> None:
     """One of two intersecting balls moves: against differences of the box-filtered image."""
     problem = make_problem("intersecting", 64)
-    every = np.arange(64 * 64)
-    target = Supersampler(problem, problem.target_positions, problem.target_colors).image(every, 64, 1)
-    view = Supersampler(problem, problem.positions, problem.colors)
     second = np.arange(len(problem.positions)) >= len(problem.positions) // 2
     fields = np.eye(3)[:, None] * second[None, :, None]
-    step = problem.step * problem.pixel_size
-    truth = np.zeros(len(fields))
-    for k, field in enumerate(fields):
-        for sign in (1, -1):
-            view.move(problem.positions + sign * step * field)
-            truth[k] += sign * pixel_losses("log-srgb-l1", view.image(every, 512, 0), target) / (2 * step * target.size)
+    target, truth = differences_along(problem, fields, 64)
     ours = Ours(problem, target, "log-srgb-l1")
     error = {}
     for name, quality in (("pairs", replace(PAIRS, samples=4)), ("edges", Quality(8.0, 16, 4))):

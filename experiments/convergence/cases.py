@@ -14,14 +14,14 @@ from appearance_opt.config import simplify_options
 from appearance_opt.fit.loop import FitOptions
 from appearance_opt.fit.model import Model, Rates
 from appearance_opt.fit.validation import Validation
-from appearance_opt.initial.sphere import random_maps, sphere
+from appearance_opt.initial.sphere import random_maps
 from appearance_opt.jobs import growth
 from appearance_opt.jobs.fitting import POOL_SAMPLES, VALIDATION_VIEWS, effort, point_width
-from appearance_opt.jobs.simplify import in_frame, support
 from appearance_opt.jobs.start import Start, make_start
 from appearance_opt.reference.mesh import MeshReference
 from appearance_opt.reference.pool import ReferencePool
-from appearance_opt.views import ViewSampler, framing
+from appearance_opt.views import ViewSampler
+from experiments.common import Framed
 
 ASSETS = Path(__file__).resolve().parents[3] / "shared" / "assets"
 SPOT, HELMET = ASSETS / "spot" / "spot.obj", ASSETS / "flight_helmet" / "FlightHelmet.gltf"
@@ -47,18 +47,12 @@ def names() -> list[str]:
 
 def make_case(name: str, seed: int) -> Case:
     """The case of that name, its reference rendered. ``seed``: of views, backgrounds and random maps."""
-    reference, sampler = _reference(SPOT if name == "sphere" else HELMET, seed)
-    case = {"sphere": _from_sphere, "decimated": _decimated, "sub-pixel": _sub_pixel}[name](reference, sampler, seed)
+    framed = Framed(load(SPOT if name == "sphere" else HELMET), seed)
+    make = {"sphere": _from_sphere, "decimated": _decimated, "sub-pixel": _sub_pixel}[name]
+    case = make(framed.reference, framed.sampler, seed)
     for group in range(case.pool.capacity // case.pool.batch):
         case.pool.draw(group)
     return case
-
-
-def _reference(path: Path, seed: int) -> tuple[MeshReference, ViewSampler]:
-    asset = load(path)
-    frame = framing(np.concatenate([m.positions for m in asset.meshes]))
-    reference = MeshReference(in_frame(asset, *frame))
-    return reference, ViewSampler((0.0, 0.0, 0.0), 1.0, seed, hull=support(reference.merged.positions))
 
 
 def _validation(reference: MeshReference, sampler: ViewSampler) -> Validation:
@@ -67,12 +61,12 @@ def _validation(reference: MeshReference, sampler: ViewSampler) -> Validation:
 
 def _from_sphere(reference: MeshReference, sampler: ViewSampler, seed: int) -> Case:
     """A sphere of 4,212 triangles becomes spot, with the preconditioned steps of ``jobs.growth``."""
-    mesh = sphere(growth.OVERSAMPLING * 1404, sampler.centre, 0.6 * sampler.radius, growth.TEXTURE)
+    mesh = growth.first_shape(1404, sampler, growth.TEXTURE)
     maps = random_maps(growth.TEXTURE, seed, True)
 
     def make() -> Model:
         model = Model(mesh, maps, frozenset(("shape", "normal", "material")), growth.RATES)
-        model.precondition(len(mesh.faces) / growth.TRIANGLES_PER_STRENGTH, growth.RATES.position)
+        model.precondition(*growth.smoothing(len(mesh.faces)))
         return model
 
     pool = ReferencePool(

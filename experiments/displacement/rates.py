@@ -13,9 +13,7 @@ from __future__ import annotations
 import argparse
 from functools import cache
 
-import numpy as np
-
-from experiments.common import OUT, Kept, source_of
+from experiments.common import OUT, Framed, Kept, source_of
 
 CASES = (
     "displacement:1,1,1",
@@ -39,17 +37,12 @@ class Bench:
         from appearance_opt import backend, load, simplify_options
         from appearance_opt.fit.validation import Validation
         from appearance_opt.jobs.fitting import point_width
-        from appearance_opt.jobs.simplify import in_frame, support
         from appearance_opt.jobs.start import make_start
-        from appearance_opt.reference.mesh import MeshReference
         from appearance_opt.reference.pool import ReferencePool
-        from appearance_opt.views import ViewSampler, framing
 
         backend.select("cpu")
-        source = load(source_of(asset))
-        frame = framing(np.concatenate([m.positions for m in source.meshes]))
-        reference = MeshReference(in_frame(source, *frame))
-        sampler = ViewSampler((0.0, 0.0, 0.0), 1.0, 0, hull=support(reference.merged.positions))
+        framed = Framed(load(source_of(asset)))
+        reference, sampler = framed.reference, framed.sampler
         options = simplify_options(triangles=TRIANGLES, displacement=True, subdivision=(LEVEL,), reallocate=0)
         self.start = make_start(reference, options, sampler, TRIANGLES)
         width = point_width(RESOLUTION, options.texture_size)

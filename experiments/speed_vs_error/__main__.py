@@ -19,11 +19,12 @@ import sys
 import time
 from pathlib import Path
 
+from experiments.common import ROOT
 from experiments.speed_vs_error import plots, tables
 from experiments.speed_vs_error.results import CurveRow, JobRow, read, scores, write
 from experiments.speed_vs_error.runner import Point, run
 from experiments.speed_vs_error.setups import DEFAULT, GROUPS, LEVERS, UNAVERAGED, Lever, Setup, default_setup
-from experiments.speed_vs_error.subjects import OUT, ROOT, SUBJECTS, Bench, Subject
+from experiments.speed_vs_error.subjects import OUT, SUBJECTS, Bench, Subject
 from experiments.speed_vs_error.whole_jobs import JOBS, run_job
 
 CURVES, WHOLE = OUT / "curves.csv", OUT / "jobs.csv"
@@ -92,7 +93,7 @@ def run_levers(subject: Subject, levers: list[Lever], seconds: float) -> None:
     todo = [lever for lever in levers if (subject.name, lever.name, seconds) not in done]
     if not todo:
         return
-    import drjit as dr
+    from appearance_opt import backend
 
     began = time.perf_counter()
     bench = _bench(subject)
@@ -103,7 +104,7 @@ def run_levers(subject: Subject, levers: list[Lever], seconds: float) -> None:
         if changed is None:
             continue
         rows += run_lever(bench, lever, changed, seconds)
-        dr.flush_malloc_cache()  # what 2048² textures took is not to be carried along
+        backend.release_memory()  # what 2048² textures took is not to be carried along
         write(CURVES, rows, CurveRow)
         fits = [r for r in rows if r.budget == seconds]
         end = tables.curve(fits, subject.name, lever.name)[-1]

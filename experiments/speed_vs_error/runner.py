@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 from typing import TYPE_CHECKING
 from unittest import mock
 
@@ -128,10 +128,4 @@ def _rates(bench: Bench, start: Start) -> Rates:
 
 def _scaled(rates: Rates | None, factor: float) -> Rates:
     assert rates is not None
-    return Rates(
-        factor * rates.position,
-        factor * rates.normal,
-        factor * rates.base_color,
-        factor * rates.material,
-        factor * rates.displacement,
-    )
+    return Rates(*(factor * rate for rate in astuple(rates)))

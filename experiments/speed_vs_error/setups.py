@@ -51,10 +51,11 @@ def default_setup(grown: bool, triangles: int) -> Setup:
     """What the product does: the preset ``default`` from a decimated mesh, or the growing of a sphere of
     ``triangles``."""
     if grown:
+        strength, rate = growth.smoothing(triangles)
         return Setup(
             growth.RESOLUTION, growth.VIEWS, growth.POOL, growth.TEXTURE, False, growth.POOL_SAMPLES,
             growth.POINT_WIDTH, growth.RATES, decay=1.0, relative=False,
-            smoothing=triangles / growth.TRIANGLES_PER_STRENGTH, smooth_rate=growth.RATES.position,
+            smoothing=strength, smooth_rate=rate,
         )  # fmt: skip
     o = simplify_options("default", ratio=1.0)
     return Setup(o.resolution, o.views, o.pool, o.texture_size, True, laplacian=o.laplacian)

@@ -6,33 +6,31 @@ import hashlib
 import json
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from appearance_opt.asset import load, save
+from appearance_opt.asset import load
 from appearance_opt.config import as_dict, simplify_options
 from appearance_opt.evaluate.metrics import compare_images
 from appearance_opt.initial.atlas import unwrap
-from appearance_opt.initial.sphere import random_maps, sphere
+from appearance_opt.initial.sphere import random_maps
 from appearance_opt.jobs import growth
 from appearance_opt.jobs.compare import render_asset
 from appearance_opt.jobs.displaced import gutter
-from appearance_opt.jobs.simplify import in_frame, support
+from appearance_opt.jobs.simplify import in_frame
 from appearance_opt.jobs.start import TIGHT_TRIANGLES, Start, budget, make_start, transferred
-from appearance_opt.reference.mesh import MeshReference
-from appearance_opt.views import ViewSampler, framing
-from scenes.build import build
+from experiments import common
+from experiments.common import Framed, source_of
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from appearance_opt.asset.types import Asset
     from appearance_opt.evaluate.metrics import Metrics
     from appearance_opt.fit.model import Model
 
-ROOT = Path(__file__).resolve().parents[2]
-OUT = ROOT / "out" / "speed_vs_error"
-REFERENCES = ROOT.parent / "shared" / "judge" / "references"
+OUT = common.OUT / "speed_vs_error"
 
 MEASURED_STREAM = 6
 """Stream of random views that no part of a job draws from."""
@@ -64,22 +62,16 @@ class Subject:
     def path(self) -> Path:
         """The file; the embedded scene is written when first asked for. FileNotFoundError where an asset is not
         there."""
-        if self.source != "relic":
-            path = REFERENCES / self.source
-            if not path.is_file():
-                raise FileNotFoundError(path)
-            return path
-        path = OUT / "relic.glb"
+        path = source_of(self.source)
         if not path.is_file():
-            OUT.mkdir(parents=True, exist_ok=True)
-            save(build("relic"), path)
+            raise FileNotFoundError(path)
         return path
 
 
 SUBJECTS = (
-    Subject("spot, from a sphere", "spot.glb", triangles=3000),
-    Subject("flight_helmet", "flight_helmet.glb", ratio=0.015),
-    Subject("chess_king", "chess_king.glb", ratio=0.015),
+    Subject("spot, from a sphere", "spot", triangles=3000),
+    Subject("flight_helmet", "flight_helmet", ratio=0.015),
+    Subject("chess_king", "chess_king", ratio=0.015),
     Subject("demo scene", "relic", ratio=0.02),
 )
 """``demo scene``: as in ``make demo``."""
@@ -90,12 +82,9 @@ class Bench:
 
     def __init__(self, subject: Subject) -> None:
         self.subject, self._path = subject, subject.path()
-        asset = load(self._path)
-        self.frame = framing(np.concatenate([m.positions for m in asset.meshes]))
-        self.asset = in_frame(asset, *self.frame)
-        self.reference = MeshReference(self.asset)
-        hull = support(self.reference.merged.positions)
-        self.sampler = ViewSampler((0.0, 0.0, 0.0), 1.0, 0, hull=hull)
+        framed = Framed(load(self._path))
+        self.frame, self.asset = framed.frame, framed.asset
+        self.reference, self.sampler = framed.reference, framed.sampler
         self._views = self.sampler.held_out(MEASURED_STREAM).draw(0, VIEWS)
         self._starts: dict[int, Start] = {}
         self._measured: dict[tuple[int, bool], Metrics] = {}
@@ -134,8 +123,7 @@ class Bench:
 
     def _sphere(self, texture: int) -> Start:
         assert self.subject.triangles is not None
-        count = growth.OVERSAMPLING * self.subject.triangles
-        mesh = sphere(count, self.sampler.centre, 0.6 * self.sampler.radius, texture)
+        mesh = growth.first_shape(self.subject.triangles, self.sampler, texture)
         return Start(mesh, {**random_maps(texture, 0, True)}, False, np.zeros((texture, texture), bool))
 
     def _decimated(self, texture: int) -> Start:

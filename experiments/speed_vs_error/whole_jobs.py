@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING
 
 from appearance_opt.asset import load
 from appearance_opt.config import PRESETS
+from experiments.common import ROOT
 from experiments.speed_vs_error.results import JobRow, scores
-from experiments.speed_vs_error.subjects import OUT, ROOT
+from experiments.speed_vs_error.subjects import OUT
 
 if TYPE_CHECKING:
     from experiments.speed_vs_error.subjects import Bench
