@@ -75,7 +75,10 @@ PresetOption = Annotated[str | None, typer.Option(help="draft, default or final.
 TextureSizeOption = Annotated[int | None, typer.Option(help="Texels per side of the maps (power of two).")]
 ResolutionOption = Annotated[int | None, typer.Option(help="Pixels per side of a training view.")]
 ViewsOption = Annotated[int | None, typer.Option(help="Views per step.")]
-PoolOption = Annotated[int | None, typer.Option(help="Reference views rendered, each used many times.")]
+PoolOption = Annotated[int | None, typer.Option(help="Reference views kept at a time.")]
+ReuseOption = Annotated[
+    int | None, typer.Option(help="How often each view is seen before a new one replaces it; 0: they stay.")
+]
 StepsOption = Annotated[int | None, typer.Option(help="Stop after this many steps.")]
 BudgetOption = Annotated[str | None, typer.Option(help="Wall-clock time for everything: 60s, 5m.")]
 NormalRateOption = Annotated[float | None, typer.Option(help="Learning rate of the normal map.")]
@@ -114,6 +117,7 @@ def simplify(
     resolution: ResolutionOption = None,
     views: ViewsOption = None,
     pool: PoolOption = None,
+    reuse: ReuseOption = None,
     steps: StepsOption = None,
     budget: BudgetOption = None,
     fit: Annotated[str | None, typer.Option(help="Subset of shape,normal,material.")] = None,
@@ -206,6 +210,7 @@ def bake(
     resolution: ResolutionOption = None,
     views: ViewsOption = None,
     pool: PoolOption = None,
+    reuse: ReuseOption = None,
     steps: StepsOption = None,
     budget: BudgetOption = None,
     loss: Annotated[str | None, typer.Option(help="As for simplify.")] = None,

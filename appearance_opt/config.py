@@ -29,7 +29,7 @@ TEXTURE_FORMATS = ("png", "exr")
 PRESETS: dict[str, dict[str, Any]] = {
     "draft": {"budget": 17.0, "resolution": 192, "pool": 64, "reallocate": 0},
     "default": {"budget": 65.0, "resolution": 256, "pool": 160, "reallocate": 1},
-    "final": {"budget": 280.0, "resolution": 320, "pool": 480, "reallocate": 2},
+    "final": {"budget": 280.0, "resolution": 320, "pool": 160, "reallocate": 2},
 }
 """What each preset sets; everything else keeps its default. See docs/performance.md for how they were
 chosen."""
@@ -41,9 +41,9 @@ class CommonOptions:
 
     ``texture_size``: texels per side of the new maps, a power of two. ``resolution``, ``views``: pixels per side and
     views of a step. ``steps``, ``budget`` (seconds for the whole job, set-up and report included): when to stop;
-    whichever comes first. ``pool``: number of reference views rendered (each is used many times). ``fit``: what
-    moves. ``*_rate``: learning rates, positions in units of the local edge length; by default they follow from how
-    good the start is. ``refine``: level for USD subdivision surfaces. ``missing_textures``: "error" or "ignore",
+    whichever comes first. ``pool``: reference views that are kept at a time; ``reuse``: how often each is seen before a
+    new one takes its place (0: they stay). ``fit``: what moves. ``*_rate``: learning rates, positions in units of the
+    local edge length; by default they follow from how good the start is. ``refine``: level for USD subdivision surfaces. ``missing_textures``: "error" or "ignore",
     when an input names a texture that is not there. ``subdivision``: tessellation levels of a displaced result (none
     given: 3); ``write_tessellated``: write those meshes, too. Raises InputError for values that make no sense.
     """
@@ -54,6 +54,7 @@ class CommonOptions:
     steps: int | None = None
     budget: float | None = None
     pool: int = 160
+    reuse: int = 2
     fit: tuple[str, ...] = ("shape", "normal", "material")
     loss: str = "log-srgb-l1"
     position_rate: float | None = None
@@ -76,6 +77,7 @@ class CommonOptions:
         _require(16 <= self.resolution <= 4096, "resolution", self.resolution, "from 16 to 4096")
         _require(1 <= self.views <= 64, "views", self.views, "from 1 to 64")
         _require(self.pool >= self.views, "pool", self.pool, "at least as many as --views")
+        _require(self.reuse >= 0, "reuse", self.reuse, "0 or more")
         _require(self.steps is None or self.steps >= 0, "steps", self.steps, "0 or more")
         _require(self.budget is None or self.budget > 0, "budget", self.budget, "a positive time such as 60s")
         _require(0 <= self.refine <= 5, "refine", self.refine, "from 0 to 5")

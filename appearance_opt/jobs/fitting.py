@@ -33,9 +33,9 @@ log = logging.getLogger(__name__)
 
 VALIDATION_VIEWS = 8
 
-POOL_SAMPLES = 32
-"""Rays per pixel of the reference's images where outlines pass: the coverage of the latent's pixels is exact, so
-that of the reference's should be, too."""
+POOL_SAMPLES = 8
+"""Rays per pixel of the reference's images where outlines pass. More views with less of them are worth more: their errors
+average out, each view is seen only ``reuse`` times."""
 
 DISPLACEMENT_RATE = 4.0
 """Rate of the displacement map in units of that of the normal map: its texels move by a fraction of the finest
@@ -106,7 +106,7 @@ def fit_start(
     """
     o = options
     width = point_width(o.resolution, o.texture_size)
-    pool = ReferencePool(reference, sampler, o.pool, o.views, o.resolution, POOL_SAMPLES, width)
+    pool = ReferencePool(reference, sampler, o.pool, o.views, o.resolution, POOL_SAMPLES, width, o.reuse)
     held_out = sampler.held_out(1).draw(0, VALIDATION_VIEWS)
     validation = Validation(reference, held_out, min(o.resolution, 256))
     parts = frozenset(o.fit) | ({DISPLACEMENT} if o.displaced else set())
@@ -165,7 +165,7 @@ def effort(psnr: float, likeness: bool) -> tuple[Quality, Rates]:
     """
     if not likeness:
         return Quality(1.0, 4, 1), Rates(0.05, 0.01, 0.02, 0.01, 0.05)
-    rate = 0.006 * float(np.clip(10 ** ((25.0 - psnr) / 16.0), 0.2, 2.0))
+    rate = 0.016 * float(np.clip(10 ** ((25.0 - psnr) / 13.0), 0.15, 2.0))
     return Quality(), Rates(rate, rate, rate, rate, DISPLACEMENT_RATE * rate)
 
 

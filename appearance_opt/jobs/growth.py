@@ -122,7 +122,7 @@ def _shaped(
     model = Model(mesh, maps, frozenset(options.fit), RATES)
     strength, rate = smoothing(len(mesh.faces))
     model.precondition(strength, pace * rate)
-    pool = ReferencePool(reference, sampler, POOL, VIEWS, RESOLUTION, POOL_SAMPLES, POINT_WIDTH)
+    pool = ReferencePool(reference, sampler, POOL, VIEWS, RESOLUTION, POOL_SAMPLES, POINT_WIDTH, options.reuse)
     validation = Validation(reference, sampler.held_out(1).draw(0, VALIDATION_VIEWS), RESOLUTION)
     fit_options = FitOptions(
         steps=effort.steps,

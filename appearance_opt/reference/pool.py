@@ -30,11 +30,15 @@ class Targets:
 
 @dataclass
 class ReferencePool:
-    """``capacity`` views drawn from ``sampler``, their images rendered when first asked for.
+    """``capacity`` views drawn from ``sampler`` at a time, their images rendered when first asked for.
 
-    A fit visits each view many times, so a slow reference, or finely sampled images of a fast one, cost
-    nothing in the long run. Which views an iteration sees is a pure function of the seed and the iteration:
-    a resumed fit sees the same, and re-renders what it needs. Images are kept in half precision.
+    The first pass sees new views in every iteration. From then on every ``reuse``-th iteration does, and its views
+    take the place of the oldest ones; the others draw at random from those that are there. So each view is seen
+    about ``reuse`` times (0: views stay for ever, which is for references that are slow): enough to spare most of the
+    rendering, and few enough that maps of a million texels are not fitted to the noise of a few hundred images.
+
+    Which views an iteration sees is a pure function of the seed and the iteration: a resumed fit sees the same,
+    and re-renders what it needs. Images are kept in half precision.
     """
 
     reference: Reference
@@ -44,18 +48,21 @@ class ReferencePool:
     resolution: int
     samples: int
     point_width: float = 0.4
+    reuse: int = 0
     _images: dict[int, NDArray[np.float16]] = field(default_factory=dict)
     _points: dict[int, NDArray[np.float16]] = field(default_factory=dict)
     _views: dict[int, Views] = field(default_factory=dict)
 
     def draw(self, iteration: int) -> tuple[Views, Targets]:
         """The views of an iteration and their images."""
-        groups = max(1, self.capacity // self.batch)
-        if iteration < groups:  # the first pass fills the pool, a whole batch at a time
-            members = np.arange(self.batch) + iteration * self.batch
+        newest, fresh = self._newest(iteration)
+        if fresh:  # a whole batch at a time
+            members = np.arange(self.batch) + newest * self.batch
         else:
             rng = np.random.default_rng([self.sampler.seed, self.sampler.stream, iteration, 1])
-            members = rng.choice(groups * self.batch, self.batch, replace=False)
+            oldest = newest - self._groups + 1
+            members = oldest * self.batch + rng.choice(self._groups * self.batch, self.batch, replace=False)
+        self._forget((newest - self._groups + 1) * self.batch)
         missing = [int(k) for k in members if int(k) not in self._images]
         if missing:
             self._render(sorted({k // self.batch for k in missing}))
@@ -67,6 +74,26 @@ class ReferencePool:
         )
         assert images is not None
         return views, Targets(images, points)
+
+    @property
+    def _groups(self) -> int:
+        """Batches that are there at a time."""
+        return max(1, self.capacity // self.batch)
+
+    def _newest(self, iteration: int) -> tuple[int, bool]:
+        """(number of the newest batch, does the iteration see that one?)"""
+        later = iteration - self._groups
+        if later < 0:
+            return iteration, True
+        if self.reuse == 0:
+            return self._groups - 1, False
+        return self._groups + later // self.reuse, later % self.reuse == 0
+
+    def _forget(self, first: int) -> None:
+        """Drop views with numbers below ``first``."""
+        for kept in (self._images, self._points, self._views):
+            for k in [k for k in kept if k < first]:
+                del kept[k]
 
     def _render(self, groups: list[int]) -> None:
         for group in groups:

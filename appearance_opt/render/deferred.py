@@ -6,21 +6,14 @@ surface's buffers and the texels; visibility is not (see ``silhouette`` for its 
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import drjit as dr
 import mitsuba as mi
-import numpy as np
-from scipy.ndimage import maximum_filter, minimum_filter
 
 from appearance_opt.render import brdf, material, rays
 from appearance_opt.render.material import MaterialMaps
 from appearance_opt.render.math import at_least
 from appearance_opt.render.rays import Samples
 from appearance_opt.render.surface import Surface, interpolate
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 NEAREST_LIGHT = 1e-3
 """Distance below which a light gets no brighter (the object's radius is 1 in a fit): a point light that touches a
@@ -133,7 +126,7 @@ def render_pair(
     points = dr.zeros(mi.Float, grid.pixels * 4)
     covered = rays.keep(hits, dr.compress(hits.triangle != rays.MISS))
     _add_shaded(points, surface, maps, records, grid, covered, 1, width, dr.ReduceMode.NoConflicts)
-    near_outline = mi.Bool(_near_outlines(hits, depth, grid))
+    near_outline = _near_outlines(hits, depth, grid)
     average = dr.select(dr.gather(mi.Bool, near_outline, dr.arange(mi.UInt32, grid.pixels * 4) // 4), 0, points)
     dr.eval(average)
     pixel = (grid.view * grid.rows + grid.row) * grid.rows + grid.column
@@ -144,14 +137,28 @@ def render_pair(
     return average, points
 
 
-def _near_outlines(hits: Samples, depth: mi.Float, grid: Grid) -> NDArray[np.bool_]:
-    """(pixels,) pixels with a jump in depth, or a border of the object, within ``OUTLINE_REACH``."""
+def _near_outlines(hits: Samples, depth: mi.Float, grid: Grid) -> mi.Bool:
+    """(pixels,) pixels with a jump in depth, or a border of the object, within ``OUTLINE_REACH``: where the largest
+    depth of a square of pixels exceeds the smallest, each found along rows first, then along columns."""
     far = dr.select(hits.triangle == rays.MISS, mi.Float(1e30), depth)
     image = dr.zeros(mi.Float, grid.pixels)
     dr.scatter(image, far, pixel_index(hits, grid.rows), mode=dr.ReduceMode.Permute)
-    depths = np.array(image).reshape(grid.views, grid.resolution, grid.resolution)
-    size = (1, 2 * OUTLINE_REACH + 1, 2 * OUTLINE_REACH + 1)
-    return (maximum_filter(depths, size) > DISCONTINUITY * minimum_filter(depths, size)).ravel()
+    i = dr.arange(mi.UInt32, grid.pixels)
+    line = i // grid.rows
+    column, row = i - line * grid.rows, line % grid.rows
+    nearest = farthest = image
+    for place, stride in ((column, mi.UInt32(1)), (row, grid.rows)):
+        dr.eval(nearest, farthest)
+        least, most = nearest, farthest
+        for away in range(1, OUTLINE_REACH + 1):
+            for neighbour, inside in ((i + away * stride, place + away < grid.rows), (i - away * stride, place >= away)):
+                at = dr.select(inside, neighbour, i)
+                least = dr.fmin(least, dr.gather(mi.Float, nearest, at))
+                most = dr.fmax(most, dr.gather(mi.Float, farthest, at))
+        nearest, farthest = least, most
+    near_outline = farthest > DISCONTINUITY * nearest
+    dr.eval(near_outline)
+    return near_outline
 
 
 def _add_shaded(
