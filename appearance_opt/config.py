@@ -27,7 +27,7 @@ GREENS = ("opengl", "directx")
 TEXTURE_FORMATS = ("png", "exr")
 
 PRESETS: dict[str, dict[str, Any]] = {
-    "draft": {"budget": 17.0, "resolution": 192, "pool": 64, "reallocate": 0},
+    "draft": {"budget": 19.0, "resolution": 192, "pool": 64, "reallocate": 0},
     "default": {"budget": 65.0, "resolution": 256, "pool": 160, "reallocate": 1},
     "final": {"budget": 280.0, "resolution": 320, "pool": 160, "reallocate": 2},
 }
