@@ -41,11 +41,12 @@ class CommonOptions:
 
     ``texture_size``: texels per side of the new maps, a power of two. ``resolution``, ``views``: pixels per side and
     views of a step. ``steps``, ``budget`` (seconds for the whole job, set-up and report included): when to stop;
-    whichever comes first. ``pool``: reference views that are kept at a time; ``reuse``: how often each is seen before a
-    new one takes its place (0: they stay). ``fit``: what moves. ``*_rate``: learning rates, positions in units of the
-    local edge length; by default they follow from how good the start is. ``refine``: level for USD subdivision surfaces. ``missing_textures``: "error" or "ignore",
-    when an input names a texture that is not there. ``subdivision``: tessellation levels of a displaced result (none
-    given: 3); ``write_tessellated``: write those meshes, too. Raises InputError for values that make no sense.
+    whichever comes first. ``pool``: reference views that are kept at a time; ``reuse``: how often each is seen before
+    a new one takes its place (0: they stay). ``fit``: what moves. ``*_rate``: learning rates, positions in units of
+    the local edge length; by default they follow from how good the start is. ``refine``: level for USD subdivision
+    surfaces. ``missing_textures``: "error" or "ignore", when an input names a texture that is not there.
+    ``subdivision``: tessellation levels of a displaced result (none given: 3); ``write_tessellated``: write those
+    meshes, too. Raises InputError for values that make no sense.
     """
 
     texture_size: int = 1024

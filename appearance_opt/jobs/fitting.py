@@ -34,8 +34,8 @@ log = logging.getLogger(__name__)
 VALIDATION_VIEWS = 8
 
 POOL_SAMPLES = 8
-"""Rays per pixel of the reference's images where outlines pass. More views with less of them are worth more: their errors
-average out, each view is seen only ``reuse`` times."""
+"""Rays per pixel of the reference's images where outlines pass. More views with fewer rays are worth more than fewer
+with many: each view is seen a few times only, and the errors of all of them average out."""
 
 DISPLACEMENT_RATE = 4.0
 """Rate of the displacement map in units of that of the normal map: its texels move by a fraction of the finest

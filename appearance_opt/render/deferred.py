@@ -151,7 +151,8 @@ def _near_outlines(hits: Samples, depth: mi.Float, grid: Grid) -> mi.Bool:
         dr.eval(nearest, farthest)
         least, most = nearest, farthest
         for away in range(1, OUTLINE_REACH + 1):
-            for neighbour, inside in ((i + away * stride, place + away < grid.rows), (i - away * stride, place >= away)):
+            after, before = (place + away < grid.rows, i + away * stride), (place >= away, i - away * stride)
+            for inside, neighbour in (after, before):
                 at = dr.select(inside, neighbour, i)
                 least = dr.fmin(least, dr.gather(mi.Float, nearest, at))
                 most = dr.fmax(most, dr.gather(mi.Float, farthest, at))

@@ -44,17 +44,21 @@ def main() -> None:
 
 
 def cases(quick: bool) -> dict[str, dict]:
-    """Sizes to time: resolution of 4 views, triangles of latent and reference, map size, live reference."""
-    base = {"resolution": 256, "latent": 3000, "reference": 100_000, "maps": 512, "live": False}
-    out = {"256": base, "256 live reference": {**base, "live": True}, "128": {**base, "resolution": 128}}
+    """Sizes to time: resolution of 4 views, triangles of latent and reference, map size, and where the reference's
+    images come from: they are "kept", rendered "live" in every step with one ray per pixel, or rendered in every second
+    step as a fit does it (``--reuse 2``, finely at outlines)."""
+    base = {"resolution": 256, "latent": 3000, "reference": 100_000, "maps": 512, "images": "kept"}
+    live, twice = {**base, "images": "live"}, {**base, "images": "twice"}
+    out = {"256": base, "256, live reference": live, "256, as in a fit": twice, "128": {**base, "resolution": 128}}
     out["512, 1024 maps"] = {**base, "resolution": 512, "maps": 1024}
     if quick:
         return out
     out["512"] = {**base, "resolution": 512}
     out["1024"] = {**base, "resolution": 1024}
     out["50k latent"] = {**base, "latent": 50_000}
-    out["10k reference, live"] = {**base, "live": True, "reference": 10_000}
-    out["1M reference, live"] = {**base, "live": True, "reference": 1_000_000}
+    for how, case in (("live", live), ("as in a fit", twice)):
+        out[f"10k reference, {how}"] = {**case, "reference": 10_000}
+        out[f"1M reference, {how}"] = {**case, "reference": 1_000_000}
     return out
 
 
@@ -64,7 +68,7 @@ def in_process(case: dict) -> dict:
     return json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout.splitlines()[-1])
 
 
-def run_case(resolution: int, latent: int, reference: int, maps: int, live: bool, steps: int = 25) -> dict:
+def run_case(resolution: int, latent: int, reference: int, maps: int, images: str, steps: int = 24) -> dict:
     """Median and range in ms of a whole step, the sum of its kernels, kernels compiled, peak memory."""
     import drjit as dr
 
@@ -73,7 +77,8 @@ def run_case(resolution: int, latent: int, reference: int, maps: int, live: bool
     from appearance_opt.fit.loop import LOSS_EVERY
     from appearance_opt.fit.losses import LOSSES
     from appearance_opt.fit.step import Gradients, StepInputs, first_non_finite, step
-    from appearance_opt.reference.pool import Targets
+    from appearance_opt.jobs.fitting import POOL_SAMPLES, point_width
+    from appearance_opt.reference.pool import ReferencePool, Targets
     from appearance_opt.render.deferred import Grid
     from appearance_opt.render.gradient import Quality
 
@@ -84,32 +89,38 @@ def run_case(resolution: int, latent: int, reference: int, maps: int, live: bool
     moments = {n: adam.moments_of(p) for n, p in model.parameters.items()}
     gradients = Gradients(model, grid, Quality(1.0, 4, 1), LOSSES["log-srgb-l1"], {0: laplacian})
     views = [sampler.draw(k, 4) for k in range(8)]
-    images = [source.render_device(v.records(), grid, 1) for v in views]
+    kept = [Targets(source.render_device(v.records(), grid, 1)) for v in views]
+    pool = ReferencePool(source, sampler, 8, 4, resolution, POOL_SAMPLES, point_width(resolution, maps), reuse=2)
+    at_once = 2 if images == "twice" else 1
 
     def one(k: int) -> None:
-        v, image = views[k % 8], images[k % 8]
-        if live:
-            image = source.render_device(v.records(), grid, 1)
+        v, target = views[k % 8], kept[k % 8]
+        if images == "twice":
+            v, target = pool.draw(k)
+        if images == "live":
+            target = Targets(source.render_device(v.records(), grid, 1))
         background = np.full((4, 3), 0.3, np.float32)
-        inputs = StepInputs(v, Targets(image), background, 0.01, 1.0, k, want_loss=k % LOSS_EVERY == 0)
+        inputs = StepInputs(v, target, background, 0.01, 1.0, k, want_loss=k % LOSS_EVERY == 0)
         step(gradients, moments, inputs, first_non_finite)
 
     for k in range(10):
         one(k)
     walls, kernels, compiled = [], [], 0
-    for k in range(steps):
+    for k in range(0, steps, at_once):
         dr.sync_thread()
         began = time.perf_counter()
-        one(k)
+        for i in range(at_once):
+            one(10 + k + i)
         dr.sync_thread()
-        walls.append(1e3 * (time.perf_counter() - began))
+        walls.append(1e3 * (time.perf_counter() - began) / at_once)
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
-        for k in range(5):
+        for k in range(0, 6, at_once):
             dr.kernel_history_clear()
-            one(k)
+            for i in range(at_once):
+                one(10 + steps + k + i)
             dr.sync_thread()
             history = dr.kernel_history()
-            kernels.append(sum(h.get("execution_time", 0.0) for h in history))
+            kernels.append(sum(h.get("execution_time", 0.0) for h in history) / at_once)
             compiled += sum(h["type"] == dr.KernelType.JIT and not h["cache_hit"] for h in history)
     return {
         "milliseconds": float(np.median(walls)),
@@ -207,7 +218,8 @@ def growth(rows: dict) -> str:
         )[0]
         out.append(f"exponent of time in pixels, 128^2 to 1024^2: {exponent:.2f}")
         out.append(f"50k latent over 3k: {t['50k latent'] / t['256']:.2f}")
-        out.append(f"1M reference over 10k, rendered live: {t['1M reference, live'] / t['10k reference, live']:.2f}")
+        for how in ("live", "as in a fit"):
+            out.append(f"1M reference over 10k, {how}: {t[f'1M reference, {how}'] / t[f'10k reference, {how}']:.2f}")
     return "\n" + "\n".join(out)
 
 

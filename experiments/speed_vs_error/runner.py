@@ -110,7 +110,9 @@ def _fit(
         model.precondition(setup.smoothing, setup.smooth_rate * setup.rate_factor)
     sampler = replace(bench.sampler, seed=setup.seed)
     width = setup.width(resolution)
-    pool = ReferencePool(bench.reference, sampler, setup.pool, setup.views, resolution, setup.pool_samples, width)
+    pool = ReferencePool(
+        bench.reference, sampler, setup.pool, setup.views, resolution, setup.pool_samples, width, setup.reuse
+    )
     options = FitOptions(
         steps=steps, seconds=seconds, loss=setup.loss, laplacian=setup.laplacian, relative=setup.relative,
         decay=setup.decay, quality=setup.quality, validate_every=2.0, seed=setup.seed,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
-from appearance_opt.config import simplify_options
+from appearance_opt.config import CommonOptions, simplify_options
 from appearance_opt.fit.loop import FitOptions
 from appearance_opt.fit.model import Rates
 from appearance_opt.jobs import fitting, growth
@@ -26,6 +26,7 @@ class Setup:
     texture: int
     decimated: bool
     pool_samples: int = fitting.POOL_SAMPLES
+    reuse: int = CommonOptions.reuse
     point_width: float | None = None
     rates: Rates | None = None
     rate_factor: float = 1.0
@@ -81,6 +82,10 @@ def _resolution(factor: float) -> Callable[[Setup], Setup]:
     return lambda s: replace(s, resolution=round(factor * s.resolution))
 
 
+def _wider(factor: float) -> Callable[[Setup], Setup]:
+    return lambda s: replace(s, point_width=factor * s.width(s.resolution))
+
+
 def _views(factor: float) -> Callable[[Setup], Setup]:
     return lambda s: replace(s, views=round(factor * s.views))
 
@@ -91,6 +96,10 @@ def _texture(factor: float) -> Callable[[Setup], Setup]:
 
 def _quality(density: float, rays: int) -> Callable[[Setup], Setup]:
     return lambda s: replace(s, quality=Quality(density, rays))
+
+
+def _reuse(times: int) -> Callable[[Setup], Setup]:
+    return lambda s: replace(s, reuse=times)
 
 
 def _loss(name: str) -> Callable[[Setup], Setup]:
@@ -134,6 +143,12 @@ LEVERS = (
     Lever("views x 1/2", "views per step", _views(0.5)),
     Lever("views x 2", "views per step", _views(2.0)),
     Lever("pool x 2/5", "views per step", lambda s: replace(s, pool=2 * s.pool // 5), core=False),
+    Lever("views stay", "reference", _reuse(0), core=False),
+    Lever("views seen 8 times", "reference", _reuse(8), core=False),
+    Lever("views seen 4 times", "reference", _reuse(4), core=False),
+    Lever("views seen once", "reference", _reuse(1), core=False),
+    Lever("32 rays at its outlines", "reference", lambda s: replace(s, pool_samples=32), core=False),
+    Lever("points 2.5 x as wide", "reference", _wider(2.5), core=False),
     Lever("no silhouette gradient", "visibility", _quality(0.0, 1)),
     Lever("4 rays at silhouettes", "visibility", _quality(1.0, 4)),
     Lever("16 rays at silhouettes", "visibility", _quality(1.0, 16)),
