@@ -152,10 +152,9 @@ def seconds_left(options: CommonOptions, watch: Stopwatch, with_report: bool) ->
 
 
 def point_width(resolution: int, texture_size: int) -> float:
-    """Width in pixels of the filter of point samples: half a texel, if the object fills both the view and the atlas.
-    Wider filters blur, and a latent that is only ever seen blurred is too sharp for renderers that do not; what narrow
-    ones alias averages out over views that are seen about twice."""
-    return float(np.clip(0.5 * resolution / texture_size, 0.1, 1.0))
+    """Width in pixels of the filter of point samples: about a texel, if the object fills both the view and the atlas.
+    Narrower would compare single texels with detail that they cannot hold, wider would blur."""
+    return float(np.clip(1.25 * resolution / texture_size, 0.4, 2.0))
 
 
 def effort(psnr: float, likeness: bool) -> tuple[Quality, Rates]:
@@ -166,7 +165,7 @@ def effort(psnr: float, likeness: bool) -> tuple[Quality, Rates]:
     """
     if not likeness:
         return Quality(1.0, 4, 1), Rates(0.05, 0.01, 0.02, 0.01, 0.05)
-    rate = 0.016 * float(np.clip(10 ** ((25.0 - psnr) / 13.0), 0.15, 2.0))
+    rate = 0.008 * float(np.clip(10 ** ((25.0 - psnr) / 10.0), 0.25, 3.5))
     return Quality(), Rates(rate, rate, rate, rate, DISPLACEMENT_RATE * rate)
 
 

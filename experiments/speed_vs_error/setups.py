@@ -148,7 +148,7 @@ LEVERS = (
     Lever("views seen 4 times", "reference", _reuse(4), core=False),
     Lever("views seen once", "reference", _reuse(1), core=False),
     Lever("32 rays at its outlines", "reference", lambda s: replace(s, pool_samples=32), core=False),
-    Lever("points 2.5 x as wide", "reference", _wider(2.5), core=False),
+    Lever("points 2/5 as wide", "reference", _wider(0.4), core=False),
     Lever("no silhouette gradient", "visibility", _quality(0.0, 1)),
     Lever("4 rays at silhouettes", "visibility", _quality(1.0, 4)),
     Lever("16 rays at silhouettes", "visibility", _quality(1.0, 16)),
