@@ -54,8 +54,8 @@ def default_setup(grown: bool, triangles: int) -> Setup:
     if grown:
         strength, rate = growth.smoothing(triangles)
         return Setup(
-            growth.RESOLUTION, growth.VIEWS, growth.POOL, growth.TEXTURE, False, growth.POOL_SAMPLES,
-            growth.POINT_WIDTH, growth.RATES, decay=1.0, relative=False,
+            growth.RESOLUTION, growth.VIEWS, growth.POOL, growth.TEXTURE, False,
+            pool_samples=growth.POOL_SAMPLES, point_width=growth.POINT_WIDTH, rates=growth.RATES, decay=1.0, relative=False,
             smoothing=strength, smooth_rate=rate,
         )  # fmt: skip
     o = simplify_options("default", ratio=1.0)
