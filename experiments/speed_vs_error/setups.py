@@ -55,8 +55,8 @@ def default_setup(grown: bool, triangles: int) -> Setup:
         strength, rate = growth.smoothing(triangles)
         return Setup(
             growth.RESOLUTION, growth.VIEWS, growth.POOL, growth.TEXTURE, False,
-            pool_samples=growth.POOL_SAMPLES, point_width=growth.POINT_WIDTH, rates=growth.RATES, decay=1.0, relative=False,
-            smoothing=strength, smooth_rate=rate,
+            pool_samples=growth.POOL_SAMPLES, point_width=growth.POINT_WIDTH, rates=growth.RATES, decay=1.0,
+            relative=False, smoothing=strength, smooth_rate=rate,
         )  # fmt: skip
     o = simplify_options("default", ratio=1.0)
     return Setup(o.resolution, o.views, o.pool, o.texture_size, True, laplacian=o.laplacian)
