@@ -304,12 +304,13 @@ def test_frozen_steps_equal_traced_ones(levels: tuple[int, ...], visibility: str
 def test_recordings_are_reused() -> None:
     model, grid = make_model(), Grid(2, 48)
     gradients = Gradients(model, grid, Quality(), LOSSES["log-srgb-l1"])
-    for k in range(12):
+    for k in range(24):
         gradients(make_inputs(model, grid, k))
     recorded = gradients.recordings()
-    for k in range(12, 24):
+    for k in range(24, 36):
         gradients(make_inputs(model, grid, k))
     # eight functions in twelve steps: 96 if nothing were reused. Now and then two lists are equally long by chance,
-    # which is recorded anew (measured: 0 to 2 times, once 10 times)
+    # which is recorded anew: up to 10 times between the first dozen of steps and the second, 0 to 4 times from there
+    # to the third (measured)
     assert recorded >= 8
-    assert gradients.recordings() <= recorded + 16
+    assert gradients.recordings() <= recorded + 8
