@@ -28,8 +28,8 @@ TEXTURE_FORMATS = ("png", "exr")
 
 PRESETS: dict[str, dict[str, Any]] = {
     "draft": {"budget": 19.0, "resolution": 192, "pool": 64, "reallocate": 0},
-    "default": {"budget": 65.0, "resolution": 256, "pool": 160, "reallocate": 1},
-    "final": {"budget": 280.0, "resolution": 320, "pool": 160, "reallocate": 2},
+    "default": {"budget": 65.0, "resolution": 256, "reallocate": 1},
+    "final": {"budget": 280.0, "resolution": 320, "reallocate": 2},
 }
 """What each preset sets; everything else keeps its default. See docs/performance.md for how they were
 chosen."""
