@@ -55,7 +55,7 @@ class CommonOptions:
     steps: int | None = None
     budget: float | None = None
     pool: int = 160
-    reuse: int = 2
+    reuse: int = 4
     fit: tuple[str, ...] = ("shape", "normal", "material")
     loss: str = "log-srgb-l1"
     position_rate: float | None = None

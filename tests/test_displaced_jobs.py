@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import mitsuba as mi
@@ -22,7 +23,7 @@ from appearance_opt.fit.loop import FitOptions, level_of
 from appearance_opt.fit.model import POSITIONS, TEXELS, Model, Rates
 from appearance_opt.fit.validation import Validation
 from appearance_opt.initial.sphere import sphere
-from appearance_opt.jobs.displaced import map_size
+from appearance_opt.jobs.displaced import REACH, displaced, map_size, median_edge, without_outliers
 from appearance_opt.jobs.joint import joint
 from appearance_opt.jobs.simplify import simplify
 from appearance_opt.latent.displacement import DISPLACEMENT, Tessellator, footprint
@@ -89,6 +90,33 @@ def test_the_map_is_as_fine_as_the_mesh() -> None:
     texels = size * np.sqrt(np.median(footprint(tessellate(mesh, 3).mesh)))
     assert 1 <= texels < 2  # texels per half edge of the finest mesh
     assert map_size(mesh, options(texture_size=32)) == 32
+
+
+def test_rays_that_meet_another_part_leave_no_spikes() -> None:
+    """A ball with a hole, inside a larger one: through the hole, rays meet the outer one."""
+    inner, outer = bumpy_sphere(20_000).meshes[0], bumpy_sphere(20_000).meshes[0]
+    hole = inner.positions[inner.faces].mean(axis=1)[:, 1] > 0.85 * inner.positions[:, 1].max()
+    holed = replace(inner, faces=inner.faces[~hole])
+    shell = replace(outer, positions=outer.positions * np.float32(1.15))
+    reference = MeshReference(Asset((holed, shell)))
+    radius = float(np.linalg.norm(inner.positions, axis=1).mean())
+    mesh, o = sphere(1200, (0.0, 0.0, 0.0), radius, 128), options(subdivision=1)
+    far = displaced(reference, mesh, o)[1][DISPLACEMENT]
+    near = displaced(reference, mesh, o, REACH * median_edge(mesh))[1][DISPLACEMENT]
+    assert far.max() > 0.1 * radius  # it is there to be met
+    assert np.abs(near).max() < REACH * median_edge(mesh) < 0.1 * radius
+
+
+def test_lone_heights_give_way_and_walls_stay() -> None:
+    heights = np.zeros((32, 32), np.float32)
+    heights[:, 16:] = 1.0  # a wall
+    heights[:, :16] += np.linspace(0, 0.2, 16, dtype=np.float32)  # a slope
+    spiked = heights.copy()
+    spiked[5, 5] = spiked[20, 25] = -3.0
+    spiked[10:12, 8] = 2.0
+    clean = without_outliers(spiked, 0.1)
+    np.testing.assert_allclose(clean, heights, atol=0.1)
+    np.testing.assert_array_equal(clean[heights == spiked], heights[heights == spiked])
 
 
 def load_ball() -> Asset:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from scipy.ndimage import median_filter
 
 from appearance_opt import backend
 from appearance_opt.asset import save
@@ -39,6 +40,14 @@ MAX_GUTTER = 16
 SAMPLES = 4
 """Rays per texel of the closed-form displacement. Hits on walls that are steep to the ray are kept: leaving them out
 costs 0.9 dB on chess_king, whose rims are such walls."""
+
+REACH = 0.5
+"""How far a decimated mesh is displaced at most, in its own median edges: farther away lies another part."""
+
+AROUND, OUTLIER = 5, 0.5
+"""A displacement that differs from the median of a square of ``AROUND`` texels by more than ``OUTLIER`` tessellated
+edges is a ray that met another part, where surfaces lie close together; the median takes its place. On chess_king these
+are 0.3 % of the texels, and with ``REACH`` the start gains 2.2 dB."""
 
 BYTES_PER_TRIANGLE = 700
 """Memory of a fit for each tessellated triangle, all levels together. Measured 500 to 550 on two threads
@@ -86,19 +95,34 @@ def flat_map(mesh: LatentMesh, options: CommonOptions) -> NDArray[np.float32]:
 
 
 def displaced(
-    reference: MeshReference, mesh: LatentMesh, options: CommonOptions
+    reference: MeshReference, mesh: LatentMesh, options: CommonOptions, reach: float | None = None
 ) -> tuple[LatentMesh, dict[str, NDArray[np.float32]]]:
-    """Closed form: the displacement map that rays along the interpolated normals find, and the mesh that it makes
-    at the finest level, to whose frames the other maps belong."""
-    size = map_size(mesh, options)
-    found = bake(reference, mesh, Settings(size, (DISPLACEMENT,), samples=SAMPLES)).maps[DISPLACEMENT]
+    """Closed form: the displacement map that rays along the interpolated normals find within ``reach`` (None: the
+    automatic cage), and the mesh that it makes at the finest level, to whose frames the other maps belong."""
+    size, level = map_size(mesh, options), max(options.levels())
+    settings = Settings(size, (DISPLACEMENT,), samples=SAMPLES, reach=reach)
+    found = bake(reference, mesh, settings).maps[DISPLACEMENT]
+    found = without_outliers(found, OUTLIER * median_edge(mesh) / 2**level)
     with dr.suspend_grad():
-        tessellator = Tessellator(mesh, max(options.levels()), tangents=False)
+        tessellator = Tessellator(mesh, level, tangents=False)
         codec = TexelCodec((DISPLACEMENT,), size)
         layer = codec.layer(codec.encode({DISPLACEMENT: found}))
         flat = mi.Float(np.ascontiguousarray(mesh.positions, np.float32).ravel())
         positions = np.array(tessellator(flat, layer)).reshape(-1, 3)
     return replace(tessellator.topology.mesh, positions=positions), {DISPLACEMENT: found}
+
+
+def median_edge(mesh: LatentMesh) -> float:
+    """Median length of the edges of the base mesh."""
+    corners = mesh.positions[mesh.faces].astype(np.float64)
+    return float(np.median(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1)))
+
+
+def without_outliers(heights: NDArray[np.float32], tolerance: float) -> NDArray[np.float32]:
+    """Heights of which none differs from the median around it by more than ``tolerance``; those that did
+    become that median."""
+    middle = median_filter(heights, AROUND)
+    return np.where(np.abs(heights - middle) > tolerance, middle, heights).astype(np.float32)
 
 
 class Exporter:

@@ -18,7 +18,7 @@ from appearance_opt.initial.sphere import SMALLEST as SMALLEST_SPHERE
 from appearance_opt.initial.sphere import random_maps, sphere
 from appearance_opt.initial.transfer import transfer
 from appearance_opt.initial.visibility import importance, pixel_counts
-from appearance_opt.jobs.displaced import displaced, flat_map, gutter, require_memory
+from appearance_opt.jobs.displaced import REACH, displaced, flat_map, gutter, median_edge, require_memory
 from appearance_opt.latent.displacement import DISPLACEMENT
 from appearance_opt.latent.latent import LatentMesh
 
@@ -163,7 +163,7 @@ def transferred(reference: MeshReference, mesh: LatentMesh, options: SimplifyOpt
     finest = None
     displacement: dict[str, NDArray] = {}
     if options.displaced:
-        finest, displacement = displaced(reference, mesh, options)
+        finest, displacement = displaced(reference, mesh, options, REACH * median_edge(mesh))
     result = transfer(reference, mesh if finest is None else finest, options.texture_size, not options.keep_hidden)
     missed = result.missed.sum() / max(result.covered.sum(), 1)
     if missed > 0.01:

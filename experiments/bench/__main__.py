@@ -45,18 +45,18 @@ def main() -> None:
 
 def cases(quick: bool) -> dict[str, dict]:
     """Sizes to time: resolution of 4 views, triangles of latent and reference, map size, and where the reference's
-    images come from: they are "kept", rendered "live" in every step with one ray per pixel, or rendered in every second
-    step as a fit does it (``--reuse 2``, finely at outlines)."""
+    images come from: they are "kept", rendered "live" in every step with one ray per pixel, or rendered as a fit does
+    it (in every ``--reuse``-th step, finely at outlines)."""
     base = {"resolution": 256, "latent": 3000, "reference": 100_000, "maps": 512, "images": "kept"}
-    live, twice = {**base, "images": "live"}, {**base, "images": "twice"}
-    out = {"256": base, "256, live reference": live, "256, as in a fit": twice, "128": {**base, "resolution": 128}}
+    live, in_fit = {**base, "images": "live"}, {**base, "images": "as in a fit"}
+    out = {"256": base, "256, live reference": live, "256, as in a fit": in_fit, "128": {**base, "resolution": 128}}
     out["512, 1024 maps"] = {**base, "resolution": 512, "maps": 1024}
     if quick:
         return out
     out["512"] = {**base, "resolution": 512}
     out["1024"] = {**base, "resolution": 1024}
     out["50k latent"] = {**base, "latent": 50_000}
-    for how, case in (("live", live), ("as in a fit", twice)):
+    for how, case in (("live", live), ("as in a fit", in_fit)):
         out[f"10k reference, {how}"] = {**case, "reference": 10_000}
         out[f"1M reference, {how}"] = {**case, "reference": 1_000_000}
     return out
@@ -72,6 +72,7 @@ def run_case(resolution: int, latent: int, reference: int, maps: int, images: st
     """Median and range in ms of a whole step, the sum of its kernels, kernels compiled, peak memory."""
     import drjit as dr
 
+    from appearance_opt.config import CommonOptions
     from appearance_opt.fit import adam
     from appearance_opt.fit.laplacian import Laplacian
     from appearance_opt.fit.loop import LOSS_EVERY
@@ -90,12 +91,14 @@ def run_case(resolution: int, latent: int, reference: int, maps: int, images: st
     gradients = Gradients(model, grid, Quality(1.0, 4, 1), LOSSES["log-srgb-l1"], {0: laplacian})
     views = [sampler.draw(k, 4) for k in range(8)]
     kept = [Targets(source.render_device(v.records(), grid, 1)) for v in views]
-    pool = ReferencePool(source, sampler, 8, 4, resolution, POOL_SAMPLES, point_width(resolution, maps), reuse=2)
-    at_once = 2 if images == "twice" else 1
+    pool = ReferencePool(
+        source, sampler, 8, 4, resolution, POOL_SAMPLES, point_width(resolution, maps), CommonOptions.reuse
+    )
+    at_once = CommonOptions.reuse if images == "as in a fit" else 1
 
     def one(k: int) -> None:
         v, target = views[k % 8], kept[k % 8]
-        if images == "twice":
+        if images == "as in a fit":
             v, target = pool.draw(k)
         if images == "live":
             target = Targets(source.render_device(v.records(), grid, 1))
@@ -114,7 +117,7 @@ def run_case(resolution: int, latent: int, reference: int, maps: int, images: st
         dr.sync_thread()
         walls.append(1e3 * (time.perf_counter() - began) / at_once)
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
-        for k in range(0, 6, at_once):
+        for k in range(0, 8, at_once):
             dr.kernel_history_clear()
             for i in range(at_once):
                 one(10 + steps + k + i)

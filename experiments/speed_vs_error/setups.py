@@ -145,7 +145,7 @@ LEVERS = (
     Lever("pool x 2/5", "views per step", lambda s: replace(s, pool=2 * s.pool // 5), core=False),
     Lever("views stay", "reference", _reuse(0), core=False),
     Lever("views seen 8 times", "reference", _reuse(8), core=False),
-    Lever("views seen 4 times", "reference", _reuse(4), core=False),
+    Lever("views seen twice", "reference", _reuse(2), core=False),
     Lever("views seen once", "reference", _reuse(1), core=False),
     Lever("32 rays at its outlines", "reference", lambda s: replace(s, pool_samples=32), core=False),
     Lever("points 2/5 as wide", "reference", _wider(0.4), core=False),
