@@ -60,6 +60,22 @@ def test_degenerate_and_disconnected_input_survives() -> None:
     assert np.isfinite(q).all()
 
 
+@pytest.mark.parametrize(("budget", "kept"), [(300, 0.97), (700, 0.98)])
+def test_small_parts_go_before_the_large_one_suffers(budget: int, kept: float) -> None:
+    rng = np.random.default_rng(0)
+    ball, bead = sphere(5000, (0.0, 0.0, 0.0), 1.0, 16), trimesh.creation.icosphere(1)
+    places = rng.normal(size=(120, 3))
+    places *= 1.1 / np.linalg.norm(places, axis=1, keepdims=True)
+    beads = [0.02 * np.asarray(bead.vertices) + x for x in places]
+    p = np.concatenate([ball.positions, *beads])
+    faces = [np.asarray(bead.faces) + len(ball.positions) + k * len(bead.vertices) for k in range(len(beads))]
+    q, g = decimate(p, np.concatenate([ball.faces, *faces]), budget)
+    assert budget - 4 < len(g) <= budget
+    largest = max(trimesh.Trimesh(q, g, process=False).split(), key=lambda part: part.area)
+    # 120 beads of at least four triangles each leave nothing of a ball at the lower budget, and 220 at the higher
+    assert largest.volume > kept * 4.19
+
+
 def test_flat_regions_cost_nothing_and_boundaries_hold() -> None:
     n = 30
     x, y = np.meshgrid(np.linspace(0, 1, n), np.linspace(0, 1, n))
