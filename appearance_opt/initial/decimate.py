@@ -283,50 +283,48 @@ def _collapse(state: _State, edges: NDArray, target: NDArray) -> None:
     state.blocked = state.blocked[~(gone | near[state.blocked >> 32] | near[state.blocked & 0xFFFFFFFF])]
 
 
-def _parts(state: _State) -> NDArray[np.int32]:
-    """(V,) number of the connected part of each vertex."""
+def _parts(faces: NDArray) -> tuple[NDArray, NDArray, NDArray]:
+    """(vertices that faces use (U,), connected part of each (U,), part of each face (F,)). Other vertices do not
+    count: near the budget they are most."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
-    f, n = state.faces, len(state.positions)
-    graph = coo_matrix((np.ones(2 * len(f)), (f[:, [0, 1]].ravel(), f[:, [1, 2]].ravel())), (n, n))
-    return connected_components(graph, directed=False)[1]
+    used, f = np.unique(faces, return_inverse=True)
+    f = f.reshape(-1, 3)
+    graph = coo_matrix((np.ones(2 * len(f)), (f[:, [0, 1]].ravel(), f[:, [1, 2]].ravel())), (len(used), len(used)))
+    part = connected_components(graph, directed=False)[1]
+    return used, part, part[f[:, 0]]
 
 
 def _drop_cheap_parts(state: _State, triangles: int, price: float) -> None:
     """Remove connected parts whose loss costs less than their triangles are worth elsewhere: ``price`` for every two.
     No part collapses to nothing, so that many small ones would take what the large ones need."""
-    part = _parts(state)
-    used = np.unique(state.faces)
-    number, label = np.unique(part[used], return_inverse=True)
-    low, high = np.full((len(number), 3), np.inf), np.full((len(number), 3), -np.inf)
-    np.minimum.at(low, label, state.positions[used])
-    np.maximum.at(high, label, state.positions[used])
+    used, part, of_face = _parts(state.faces)
+    count = np.bincount(of_face)
+    low, high = np.full((len(count), 3), np.inf), np.full((len(count), 3), -np.inf)
+    np.minimum.at(low, part, state.positions[used])
+    np.maximum.at(high, part, state.positions[used])
     q = state.quadrics[used]
-    weight = np.bincount(label, q[:, 0] + q[:, 3] + q[:, 5])
-    place = np.searchsorted(number, part[state.faces[:, 0]])
-    count = np.bincount(place, minlength=len(number))
-    cost = LOST * np.sqrt(weight) * np.sum((high - low) ** 2, axis=1) * 2 / np.maximum(count, 1)
+    weight = np.bincount(part, q[:, 0] + q[:, 3] + q[:, 5])
+    cost = LOST * np.sqrt(weight) * np.sum((high - low) ** 2, axis=1) * 2 / count
     order = np.argsort(cost)
     excess = len(state.faces) - triangles
     gone = order[(cost[order] < price) & (np.cumsum(count[order]) <= excess)]
     gone = gone[weight[gone] < weight.max()]
-    if len(gone):
-        state.faces = state.faces[~np.isin(place, gone)]
+    state.faces = state.faces[~np.isin(of_face, gone)]
 
 
 def _drop_smallest_parts(state: _State, triangles: int) -> None:
     """Remove whole connected parts, the smallest first, until the budget is met."""
     f = state.faces
-    label = _parts(state)[f[:, 0]]
+    _, _, of_face = _parts(f)
     p = state.positions[f]
     area = np.linalg.norm(np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]), axis=1)
-    size = np.bincount(label, area)
-    count = np.bincount(label)
-    order = np.argsort(np.where(count > 0, size, np.inf))
+    count = np.bincount(of_face)
+    order = np.argsort(np.bincount(of_face, area))
     excess = len(f) - triangles
     gone = np.cumsum(count[order]) - count[order] < excess
-    state.faces = f[~np.isin(label, order[gone])]
+    state.faces = f[~np.isin(of_face, order[gone])]
 
 
 def _touching(marked: NDArray[np.bool_], faces: NDArray) -> NDArray[np.bool_]:

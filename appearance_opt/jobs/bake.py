@@ -171,6 +171,11 @@ class BakeJob:
         self.watch.lap("export")
         return result, error
 
+    @property
+    def cage(self) -> float | None:
+        """``--cage`` in units of the frame; None for the automatic one."""
+        return None if self.options.cage is None else self.options.cage / self.frame[1]
+
     def _settings(self):
         from appearance_opt.baking.closed_form import FIELDS, Settings
 
@@ -184,7 +189,7 @@ class BakeJob:
             o.texture_size,
             tuple(n for n in FIELDS if n in wanted),
             o.samples,
-            None if o.cage is None else o.cage / scale,
+            self.cage,
             o.hit,  # type: ignore[arg-type]
             o.ao_rays,
             float("inf") if o.ao_distance is None else o.ao_distance / scale,

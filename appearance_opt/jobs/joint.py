@@ -74,8 +74,7 @@ def _fitted(job, light: Asset, options: BakeOptions, progress: Progress | None, 
     from appearance_opt.jobs.start import Start
 
     mesh = movable(job.mesh)
-    cage = None if options.cage is None else options.cage / job.frame[1]
-    drawn, displacement = displaced(job.reference, mesh, options, cage)
+    drawn, displacement = displaced(job.reference, mesh, options, job.cage)
     found = bake(job.reference, drawn, Settings(options.texture_size, samples=options.samples))
     maps = {n: v for n, v in found.maps.items() if options.wants("normal") or not n.startswith("normal")}
     start = Start(mesh, {**maps, **displacement}, True, found.covered, options.levels())

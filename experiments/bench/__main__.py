@@ -15,6 +15,7 @@ import resource
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -70,8 +71,6 @@ def in_process(case: dict) -> dict:
 
 def run_case(resolution: int, latent: int, reference: int, maps: int, images: str, steps: int = 24) -> dict:
     """Median and range in ms of a whole step, the sum of its kernels, kernels compiled, peak memory."""
-    import drjit as dr
-
     from appearance_opt.config import CommonOptions
     from appearance_opt.fit import adam
     from appearance_opt.fit.laplacian import Laplacian
@@ -106,6 +105,18 @@ def run_case(resolution: int, latent: int, reference: int, maps: int, images: st
         inputs = StepInputs(v, target, background, 0.01, 1.0, k, want_loss=k % LOSS_EVERY == 0)
         step(gradients, moments, inputs, first_non_finite)
 
+    return {
+        **timings(one, steps, at_once),
+        "peak_gib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20,
+        "triangles": len(mesh.faces),
+    }
+
+
+def timings(one: Callable[[int], None], steps: int, at_once: int) -> dict:
+    """Wall-clock time of ``steps`` calls after warm-up, then kernel times and compilations of eight more. Times are per
+    call and in ms; ``at_once``: calls that are timed together, for they differ."""
+    import drjit as dr
+
     for k in range(10):
         one(k)
     walls, kernels, compiled = [], [], 0
@@ -130,8 +141,6 @@ def run_case(resolution: int, latent: int, reference: int, maps: int, images: st
         "range": [float(min(walls)), float(max(walls))],
         "kernels": float(np.median(kernels)),
         "compiled": int(compiled),
-        "peak_gib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20,
-        "triangles": len(mesh.faces),
     }
 
 
