@@ -1,4 +1,4 @@
-"""Shared fixtures. Tests run on the CPU variant."""
+"""Shared fixtures. Tests run on the CPU, or on a GPU with ``pytest --device cuda``."""
 
 from __future__ import annotations
 
@@ -11,10 +11,14 @@ from appearance_opt import backend
 from appearance_opt.asset.types import Asset, Material, Mesh, Texture
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--device", default="cpu", choices=("cpu", "cuda"), help="what Dr.Jit computes on")
+
+
 @pytest.fixture(scope="session", autouse=True)
-def variant() -> str:
-    """All tests share the LLVM variant."""
-    return backend.select("cpu").variant
+def variant(request: pytest.FixtureRequest) -> str:
+    """All tests share one variant."""
+    return backend.select(request.config.getoption("--device")).variant
 
 
 @pytest.fixture(scope="session")

@@ -16,7 +16,7 @@ from experiments.speed_vs_error.setups import DEFAULT, LEVERS, default_setup
 from tests.test_fit import make_fit
 
 
-def test_a_fit_that_is_stopped_and_gone_on_with_equals_one_that_is_not(ball: Asset) -> None:
+def test_a_fit_that_is_stopped_and_gone_on_with_equals_one_that_is_not(ball: Asset, variant: str) -> None:
     options = FitOptions(steps=8)
     whole, parts = Recorder(()), Recorder(())
     model, pool, _ = make_fit(ball)
@@ -31,7 +31,8 @@ def test_a_fit_that_is_stopped_and_gone_on_with_equals_one_that_is_not(ball: Ass
             difference = np.abs(np.array(getattr(parts.snapshots[-1], kind)[name]) - np.array(expected))
             # threads add up gradients in no fixed order: 2e-7 in most runs; in one of 15, one vertex came out 2e-4
             # apart. Without Adam's moments the median alone is 2e-3.
-            assert np.quantile(difference, 0.95) < 1e-5
+            # A GPU's thousands of threads: 1.03e-5.
+            assert np.quantile(difference, 0.95) < (1e-5 if variant.startswith("llvm") else 1e-4)
             assert difference.max() < 2e-3
 
 

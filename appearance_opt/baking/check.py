@@ -89,7 +89,7 @@ def overlap(mesh: LatentMesh, size: int = OVERLAP_SIZE) -> tuple[int, float]:
             scale = dr.opaque(mi.Float, 1 / size)
             u = (mi.Float(i % size) + 0.5) * scale
             v = (mi.Float(i // size) + dr.opaque(mi.Float, row + 0.5)) * scale
-            first, second = _two_hits(scene, inset, u, v)
+            first, second = _two_hits(scene, inset, count, u, v)
             both = second != NONE
             for hit in (first, second):
                 dr.scatter(marked, mi.UInt32(1), dr.select(both, hit, 0), both)
@@ -104,9 +104,10 @@ PASSES = 4
 """Triangles whose very edge a point may touch before it is given up."""
 
 
-def _two_hits(scene: mi.Scene, inset: mi.Float, u: mi.Float, v: mi.Float) -> tuple[mi.UInt32, mi.UInt32]:
-    """The first two triangles, from above, that hold the points well inside; ``NONE`` for none."""
-    top = mi.Float(2)
+def _two_hits(scene: mi.Scene, inset: mi.Float, count: int, u: mi.Float, v: mi.Float) -> tuple[mi.UInt32, mi.UInt32]:
+    """The first two triangles, from above, that hold the points well inside; ``NONE`` for none. ``count``: of all
+    triangles."""
+    top, layer = mi.Float(2), dr.opaque(mi.Float, 1 / count)
     first, second = mi.UInt32(NONE), mi.UInt32(NONE)
     for _ in range(PASSES):
         ray = mi.Ray3f(mi.Point3f(u, v, top), mi.Vector3f(0, 0, -1))
@@ -118,7 +119,8 @@ def _two_hits(scene: mi.Scene, inset: mi.Float, u: mi.Float, v: mi.Float) -> tup
         inside = valid & (1 - b1 - b2 > least.x) & (b1 > least.y) & (b2 > least.z)
         second = dr.select(inside & (first != NONE), hit.prim_index, second)
         first = dr.select(inside & (first == NONE), hit.prim_index, first)
-        top = dr.select(valid, top - hit.t * (1 + 1e-7) - 1e-7, -1)
+        # half a layer below the triangle: from its own height, a ray may meet it once more
+        top = dr.select(valid, mi.Float(prim) * layer, -1)
         dr.eval(first, second, top)
     return first, second
 

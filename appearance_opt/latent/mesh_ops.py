@@ -16,6 +16,10 @@ from appearance_opt.render.math import at_least, unit
 
 TINY = 1e-20
 
+CANCELLED = 1e-6
+"""Unit vectors cancel when the length of their weighted sum is less than this share of the weights: rounding leaves
+about 1e-7, where multiplications and additions are fused."""
+
 
 @dataclass
 class Corners:
@@ -35,13 +39,12 @@ def vertex_normals(positions: mi.Float, corners: Corners) -> mi.Vector3f:
     p = [dr.gather(mi.Point3f, positions, i) for i in corners.vertex]
     normal = unit(dr.cross(p[1] - p[0], p[2] - p[0]))
     total = dr.zeros(mi.Float, dr.width(positions))
+    weight = dr.zeros(mi.Float, dr.width(positions) // 3)
     for k in range(3):
         angle = _angle(unit(p[(k + 1) % 3] - p[k]), unit(p[(k + 2) % 3] - p[k]))
         dr.scatter_add(total, normal * angle, corners.vertex[k])
-    summed = dr.unravel(mi.Vector3f, total)
-    squared = dr.squared_norm(summed)
-    ok = squared > TINY
-    return dr.select(ok, summed * dr.rsqrt(dr.select(ok, squared, 1)), mi.Vector3f(0, 0, 1))
+        dr.scatter_add(weight, dr.detach(angle), corners.vertex[k])
+    return _direction(dr.unravel(mi.Vector3f, total), weight, mi.Vector3f(0, 0, 1))
 
 
 def tangent_frames(positions: mi.Float, normals: mi.Vector3f, corners: Corners) -> mi.Vector3f:
@@ -54,17 +57,23 @@ def tangent_frames(positions: mi.Float, normals: mi.Vector3f, corners: Corners) 
     along_u = ((p[1] - p[0]) * b.y - (p[2] - p[0]) * a.y) * dr.sign(determinant)
     usable = dr.abs(determinant) > TINY
     total = dr.zeros(mi.Float, 3 * dr.width(corners.frame_vertex))
+    weight = dr.zeros(mi.Float, dr.width(corners.frame_vertex))
     for k in range(3):
         n = dr.gather(mi.Vector3f, normals, corners.vertex[k])
         edge, other = p[(k + 1) % 3] - p[k], p[(k + 2) % 3] - p[k]
         angle = _angle(unit(_in_plane(edge, n)), unit(_in_plane(other, n)))
         value = dr.select(usable, unit(_in_plane(along_u, n)) * angle, 0)
         dr.scatter_add(total, value, corners.frame[k])
-    summed = dr.unravel(mi.Vector3f, total)
-    squared = dr.squared_norm(summed)
-    ok = squared > TINY
+        dr.scatter_add(weight, dr.detach(angle), corners.frame[k])
     n = dr.gather(mi.Vector3f, normals, corners.frame_vertex)
     fallback = dr.normalize(dr.cross(n, dr.select(dr.abs(n.x) < 0.9, mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0))))
+    return _direction(dr.unravel(mi.Vector3f, total), weight, fallback)
+
+
+def _direction(summed: mi.Vector3f, weight: mi.Float, fallback: mi.Vector3f) -> mi.Vector3f:
+    """Unit vector along a sum of unit vectors with the given total ``weight``; ``fallback`` where they cancel."""
+    squared = dr.squared_norm(summed)
+    ok = squared > dr.square(CANCELLED * weight)
     return dr.select(ok, summed * dr.rsqrt(dr.select(ok, squared, 1)), fallback)
 
 

@@ -14,6 +14,7 @@ from appearance_opt.asset.tangents import any_tangent, split_and_tangents
 from appearance_opt.reference.textures import material_maps
 from appearance_opt.render import deferred, upload
 from appearance_opt.render.deferred import Grid
+from appearance_opt.render.freezing import Frozen
 from appearance_opt.render.material import evaluate, shading_normal
 from appearance_opt.render.surface import Surface, face_normal, interpolate_at
 
@@ -68,6 +69,8 @@ class MeshReference:
             colors=None if m.colors is None else upload.packets(4, m.colors),
             has_tangents=m.tangents is not None,
         )
+        self._run = Frozen(self.surface, self.maps)
+        self._grid: Grid | None = None
 
     def render(self, views: Views, resolution: int, samples: int = 16) -> NDArray[np.float32]:
         """See ``Reference.render``."""
@@ -82,7 +85,9 @@ class MeshReference:
         pairs = []
         with dr.suspend_grad():
             for part, grid in self._parts(views, resolution):
-                both = deferred.render_pair(self.scene, self.surface, self.maps, part.records(), grid, samples, width)
+                both = deferred.render_pair(
+                    self.scene, self.surface, self.maps, part.records(), grid, samples, width, self._run
+                )
                 pairs.append([_host(image, grid) for image in both])
         average, points = (np.concatenate(images) for images in zip(*pairs, strict=True))
         return average, points
@@ -90,18 +95,21 @@ class MeshReference:
     def _parts(self, views: Views, resolution: int) -> Iterator[tuple[Views, Grid]]:
         """Views in batches of at most ``MAX_PIXELS`` pixels, with their grids."""
         step = max(1, MAX_PIXELS // (resolution * resolution))
-        grid = None
         for start in range(0, len(views), step):
             part = views[start : start + step]
-            if grid is None or grid.views != len(part):
-                grid = Grid(len(part), resolution)
-            yield part, grid
+            yield part, self._grid_of(len(part), resolution)
+
+    def _grid_of(self, views: int, resolution: int) -> Grid:
+        """The pixels of a batch; the last ones are kept, for batches come in equal sizes."""
+        if self._grid is None or (self._grid.views, self._grid.resolution) != (views, resolution):
+            self._grid = Grid(views, resolution)
+        return self._grid
 
     def render_device(self, records: mi.Float, grid: Grid, samples: int, width: float | None = None) -> mi.Float:
         """The same for a batch whose records are on the device; the image stays there, flat. Textures are filtered
         over ``width`` pixels (the share of a sample)."""
         with dr.suspend_grad():
-            return deferred.render_image(self.scene, self.surface, self.maps, records, grid, samples, width)
+            return deferred.render_image(self.scene, self.surface, self.maps, records, grid, samples, width, self._run)
 
     def sample(self, triangle: mi.UInt32, b1: mi.Float, b2: mi.Float, area: mi.Float) -> SurfaceSample:
         """Appearance at barycentric points of triangles, averaged over a patch of ``area`` (world units

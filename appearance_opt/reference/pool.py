@@ -5,9 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from appearance_opt.backend import to_device
 from appearance_opt.errors import ReferenceRenderError
 from appearance_opt.reference.base import PointReference
 from appearance_opt.views import Views
@@ -17,6 +19,10 @@ if TYPE_CHECKING:
 
     from appearance_opt.reference.base import Reference
     from appearance_opt.views import ViewSampler
+
+
+LARGEST = float(np.finfo(np.float16).max)
+"""Brightest radiance that is kept."""
 
 
 @dataclass(frozen=True)
@@ -108,9 +114,9 @@ class ReferencePool:
                 self._views[group * self.batch + k] = views[k : k + 1]
 
     def _keep(self, kept: dict[int, NDArray[np.float16]], group: int, images: NDArray[np.float32]) -> None:
-        images = np.minimum(checked(images, f"pool batch {group}"), np.finfo(np.float16).max).astype(np.float16)
-        for k in range(self.batch):
-            kept[group * self.batch + k] = images[k].ravel()
+        # NumPy takes ten times as long to halve the precision
+        halved = np.array(mi.Float16(dr.minimum(to_device(checked(images, f"pool batch {group}")), LARGEST)))
+        kept.update(enumerate(halved.reshape(self.batch, -1), group * self.batch))
 
 
 def checked(images: NDArray[np.float32], what: str) -> NDArray[np.float32]:

@@ -6,14 +6,20 @@ surface's buffers and the texels; visibility is not (see ``silhouette`` for its 
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import drjit as dr
 import mitsuba as mi
 
 from appearance_opt.render import brdf, material, rays
+from appearance_opt.render.freezing import traced
 from appearance_opt.render.material import MaterialMaps
 from appearance_opt.render.math import at_least
 from appearance_opt.render.rays import Samples
 from appearance_opt.render.surface import Surface, interpolate
+
+if TYPE_CHECKING:
+    from appearance_opt.render.freezing import Run
 
 NEAREST_LIGHT = 1e-3
 """Distance below which a light gets no brighter (the object's radius is 1 in a fit): a point light that touches a
@@ -80,9 +86,10 @@ def render_image(
     grid: Grid,
     samples: int,
     width: float | None = None,
+    run: Run = traced,
 ) -> mi.Float:
     """A whole batch of images with ``samples`` samples in every pixel, without gradients. Textures are filtered
-    over ``width`` pixels (the share of a sample).
+    over ``width`` pixels (the share of a sample). ``run``: how its stages are called (see ``freezing``).
 
     Returns (pixels * 4) premultiplied linear radiance and coverage. One sample of all pixels at a time,
     so that memory does not grow with ``samples``.
@@ -90,13 +97,10 @@ def render_image(
     filtered = samples**-0.5 if width is None else width
     image = dr.zeros(mi.Float, grid.pixels * 4)
     for dx, dy in rays.sub_pixel_offsets(samples):
-        x = mi.Float(grid.column) + dr.opaque(mi.Float, dx)
-        y = mi.Float(grid.row) + dr.opaque(mi.Float, dy)
-        hits = rays.trace(scene, records, grid.view, x, y, grid.size)
-        dr.eval(hits)
-        covered = rays.keep(hits, dr.compress(hits.triangle != rays.MISS))
+        hits, _, covered = _seen(scene, records, grid, dx, dy, run)
         # one sample per pixel in each pass: no two threads meet
-        _add_shaded(image, surface, maps, records, grid, covered, samples, filtered, dr.ReduceMode.NoConflicts)
+        mode = dr.ReduceMode.NoConflicts
+        image = _with_shaded(image, surface, maps, records, grid, hits, covered, 1 / samples, filtered, mode, run)
     return image
 
 
@@ -115,43 +119,74 @@ def render_pair(
     grid: Grid,
     samples: int,
     width: float,
+    run: Run = traced,
 ) -> tuple[mi.Float, mi.Float]:
     """(average, points): two images of the same views. ``points`` is what the ray through the middle of each pixel
     sees, textures filtered over ``width`` pixels; ``average`` is the same away from outlines, and the mean of
-    ``samples`` rays near them. Costs a fraction of ``samples`` full images."""
-    hits, depth = rays.trace_depth(
-        scene, records, grid.view, mi.Float(grid.column) + 0.5, mi.Float(grid.row) + 0.5, grid.size
-    )
-    dr.eval(hits, depth)
-    points = dr.zeros(mi.Float, grid.pixels * 4)
-    covered = rays.keep(hits, dr.compress(hits.triangle != rays.MISS))
-    _add_shaded(points, surface, maps, records, grid, covered, 1, width, dr.ReduceMode.NoConflicts)
-    near_outline = _near_outlines(hits, depth, grid)
-    average = dr.select(dr.gather(mi.Bool, near_outline, dr.arange(mi.UInt32, grid.pixels * 4) // 4), 0, points)
-    dr.eval(average)
-    pixel = (grid.view * grid.rows + grid.row) * grid.rows + grid.column
-    index = dr.compress(dr.gather(mi.Bool, near_outline, pixel))
+    ``samples`` rays near them. Costs a fraction of ``samples`` full images. ``run``: as in ``render_image``."""
+    hits, depth, covered = _seen(scene, records, grid, 0.5, 0.5, run)
+    points, mode = dr.zeros(mi.Float, grid.pixels * 4), dr.ReduceMode.NoConflicts
+    points = _with_shaded(points, surface, maps, records, grid, hits, covered, 1.0, width, mode, run)
+    average, outlined = run(_without_outlines, points, hits, depth, grid.rows, grid.pixels)
+    dr.eval(average, outlined)
+    index = dr.compress(outlined)
     if dr.width(index):
-        fine = rays.trace_pixels(scene, records, grid.view, grid.column, grid.row, index, samples, grid.size)
-        _add_shaded(average, surface, maps, records, grid, fine, samples, samples**-0.5, dr.ReduceMode.Local)
+        fine = rays.trace_pixels(scene, records, grid.view, grid.column, grid.row, index, samples, grid.size, run)
+        every, mode = dr.arange(mi.UInt32, dr.width(fine.triangle)), dr.ReduceMode.Local
+        average = _with_shaded(
+            average, surface, maps, records, grid, fine, every, 1 / samples, samples**-0.5, mode, run
+        )
     return average, points
 
 
-def _near_outlines(hits: Samples, depth: mi.Float, grid: Grid) -> mi.Bool:
+def _seen(
+    scene: mi.Scene, records: mi.Float, grid: Grid, dx: float, dy: float, run: Run
+) -> tuple[Samples, mi.Float, mi.UInt32]:
+    """(what the ray at the offset (dx, dy) in every pixel hits, its depth, indices of those that hit)."""
+    offset = dr.opaque(mi.Float, dx), dr.opaque(mi.Float, dy)
+    hits, depth, hit = run(_traced_at, scene, records, grid.view, grid.column, grid.row, *offset, grid.size)
+    dr.eval(hits, depth, hit)
+    return hits, depth, dr.compress(hit)
+
+
+def _traced_at(
+    scene: mi.Scene,
+    records: mi.Float,
+    view: mi.UInt32,
+    column: mi.UInt32,
+    row: mi.UInt32,
+    dx: mi.Float,
+    dy: mi.Float,
+    size: mi.Float,
+) -> tuple[Samples, mi.Float, mi.Bool]:
+    hits, depth = rays.trace_depth(scene, records, view, mi.Float(column) + dx, mi.Float(row) + dy, size)
+    return hits, depth, hits.triangle != rays.MISS
+
+
+def _without_outlines(
+    points: mi.Float, hits: Samples, depth: mi.Float, rows: mi.UInt32, pixels: int
+) -> tuple[mi.Float, mi.Bool]:
+    """(the image ``points`` with zeros in the pixels near outlines, whether the pixel of each of ``hits`` is one)."""
+    near = _near_outlines(hits, depth, rows, pixels)
+    image = dr.select(dr.gather(mi.Bool, near, dr.arange(mi.UInt32, pixels * 4) // 4), 0, points)
+    return image, dr.gather(mi.Bool, near, pixel_index(hits, rows))
+
+
+def _near_outlines(hits: Samples, depth: mi.Float, rows: mi.UInt32, pixels: int) -> mi.Bool:
     """(pixels,) pixels with a jump in depth, or a border of the object, within ``OUTLINE_REACH``: where the largest
     depth of a square of pixels exceeds the smallest, each found along rows first, then along columns."""
     far = dr.select(hits.triangle == rays.MISS, mi.Float(1e30), depth)
-    image = dr.zeros(mi.Float, grid.pixels)
-    dr.scatter(image, far, pixel_index(hits, grid.rows), mode=dr.ReduceMode.Permute)
-    i = dr.arange(mi.UInt32, grid.pixels)
-    line = i // grid.rows
-    column, row = i - line * grid.rows, line % grid.rows
+    image = dr.zeros(mi.Float, pixels)
+    dr.scatter(image, far, pixel_index(hits, rows), mode=dr.ReduceMode.Permute)
+    i = dr.arange(mi.UInt32, pixels)
+    line = i // rows
+    column, row = i - line * rows, line % rows
     nearest = farthest = image
-    for place, stride in ((column, mi.UInt32(1)), (row, grid.rows)):
+    for place, stride in ((column, mi.UInt32(1)), (row, rows)):
         dr.eval(nearest, farthest)
         least, most = nearest, farthest
         for away in range(1, OUTLINE_REACH + 1):
-            after, before = (place + away < grid.rows, i + away * stride), (place >= away, i - away * stride)
+            after, before = (place + away < rows, i + away * stride), (place >= away, i - away * stride)
             for inside, neighbour in (after, before):
                 at = dr.select(inside, neighbour, i)
                 least = dr.fmin(least, dr.gather(mi.Float, nearest, at))
@@ -162,22 +197,45 @@ def _near_outlines(hits: Samples, depth: mi.Float, grid: Grid) -> mi.Bool:
     return near_outline
 
 
-def _add_shaded(
+def _with_shaded(
     image: mi.Float,
     surface: Surface,
     maps: MaterialMaps,
     records: mi.Float,
     grid: Grid,
     hits: Samples,
-    samples: int,
+    index: mi.UInt32,
+    weight: float,
     width: float,
     mode: dr.ReduceMode,
-) -> None:
-    """Add the radiance and coverage of hits, each 1 / ``samples`` of its pixel, to an image (pixels * 4)."""
-    if dr.width(hits.triangle) == 0:
-        return
-    color = shade(surface, maps, records, hits, grid.size, dr.opaque(mi.Float, width))
-    w = dr.opaque(mi.Float, 1 / samples)
-    value = mi.ArrayXf([color.x * w, color.y * w, color.z * w, w])
-    dr.scatter_reduce(dr.ReduceOp.Add, image, value, pixel_index(hits, grid.rows), mode=mode)
-    dr.eval(image)
+    run: Run,
+) -> mi.Float:
+    """An image (pixels * 4) and the radiance and coverage of the hits at the positions ``index`` of the list, each
+    ``weight`` of its pixel."""
+    if dr.width(index) == 0:
+        return image
+    share, filtered = dr.opaque(mi.Float, weight), dr.opaque(mi.Float, width)
+    out = run(_added, image, surface, maps, records, hits, index, share, filtered, grid.size, grid.rows, mode)
+    dr.eval(out)
+    return out
+
+
+def _added(
+    image: mi.Float,
+    surface: Surface,
+    maps: MaterialMaps,
+    records: mi.Float,
+    hits: Samples,
+    index: mi.UInt32,
+    weight: mi.Float,
+    width: mi.Float,
+    size: mi.Float,
+    rows: mi.UInt32,
+    mode: dr.ReduceMode,
+) -> mi.Float:
+    some = rays.keep(hits, index)
+    color = shade(surface, maps, records, some, size, width)
+    value = mi.ArrayXf([color.x * weight, color.y * weight, color.z * weight, weight])
+    out = mi.Float(image)
+    dr.scatter_reduce(dr.ReduceOp.Add, out, value, pixel_index(some, rows), mode=mode)
+    return out

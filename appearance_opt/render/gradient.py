@@ -239,7 +239,9 @@ def _camera_samples(
         place = dr.compress(dr.gather(mi.Bool, on_edge, pixel))
         crossed = dr.gather(mi.UInt32, pixel, place)
         parts.append(
-            rays.trace_pixels(scene, records, grid.view, grid.column, grid.row, place, quality.edge_samples, grid.size)
+            rays.trace_pixels(
+                scene, records, grid.view, grid.column, grid.row, place, quality.edge_samples, grid.size, run
+            )
         )
         weights.append(1 / quality.edge_samples)
     return _weighted(parts, weights, grid, quality.sample_width), deferred, crossed

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import importlib
 import sys
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 
-import drjit.llvm.ad as arrays
+import mitsuba as mi
 
 
 def in_double(module: ModuleType, **replaced: object) -> ModuleType:
     """The module's source executed once more, with double arrays where it says ``mi.Float`` and so on.
     ``replaced``: names of the module to set afterwards, e.g. functions it imports from another."""
+    cuda = mi.variant().startswith("cuda")
+    arrays = importlib.import_module("drjit.cuda.ad" if cuda else "drjit.llvm.ad")
     three, two = arrays.Array3f64, arrays.Array2f64
     types = SimpleNamespace(
         Float=arrays.Float64, Bool=arrays.Bool, UInt32=arrays.UInt, Int32=arrays.Int,

@@ -1,6 +1,6 @@
 """Time of one step, by size and by stage, on an embedded scene.
 
-    python -m experiments.bench [--quick]
+    python -m experiments.bench [--quick] [--device cuda]
 
 Prints Markdown tables for docs/performance.md and writes out/bench.json. Medians and ranges over steps after warm-up;
 compare ratios within one run, not times between machines.
@@ -28,14 +28,16 @@ OUT = Path("out")
 def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--quick", action="store_true", help="fewer sizes and repetitions")
+    parser.add_argument("--device", default="cpu", choices=("cpu", "cuda"))
     parser.add_argument("--case", help="run one case in this process and print its JSON")
     a = parser.parse_args()
-    found = backend.select("cpu")
+    found = backend.select(a.device)
     if a.case:
         print(json.dumps(run_case(**json.loads(a.case))))
         return
-    print(f"{platform.processor() or platform.machine()}, {found.threads} threads, LLVM {found.llvm}\n")
-    rows = {name: in_process(case) for name, case in cases(a.quick).items()}
+    threads = f"{found.threads} threads, LLVM {found.llvm}" if found.llvm else "CUDA"
+    print(f"{platform.processor() or platform.machine()}, {threads}\n")
+    rows = {name: in_process(case, a.device) for name, case in cases(a.quick).items()}
     print(table(rows))
     print(growth(rows))
     if not a.quick:
@@ -63,9 +65,9 @@ def cases(quick: bool) -> dict[str, dict]:
     return out
 
 
-def in_process(case: dict) -> dict:
+def in_process(case: dict, device: str) -> dict:
     """Each case in a process of its own: its peak memory is its own."""
-    command = [sys.executable, "-m", "experiments.bench", "--case", json.dumps(case)]
+    command = [sys.executable, "-m", "experiments.bench", "--device", device, "--case", json.dumps(case)]
     return json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout.splitlines()[-1])
 
 
@@ -81,6 +83,7 @@ def run_case(resolution: int, latent: int, reference: int, maps: int, images: st
     from appearance_opt.reference.pool import ReferencePool, Targets
     from appearance_opt.render.deferred import Grid
     from appearance_opt.render.gradient import Quality
+    from experiments.bench.scene import set_up
 
     source, model, sampler = set_up(latent, reference, maps)
     grid = Grid(4, resolution)
@@ -142,23 +145,6 @@ def timings(one: Callable[[int], None], steps: int, at_once: int) -> dict:
         "kernels": float(np.median(kernels)),
         "compiled": int(compiled),
     }
-
-
-def set_up(latent: int, reference: int, maps: int):
-    """A bumpy sphere, and a smooth coarse one with random maps as its latent."""
-    from appearance_opt.fit.model import Model, Rates
-    from appearance_opt.initial.sphere import random_maps, sphere
-    from appearance_opt.jobs.simplify import in_frame
-    from appearance_opt.reference.mesh import MeshReference
-    from appearance_opt.views import ViewSampler, framing
-    from scenes.analytic import bumpy_sphere
-
-    asset = bumpy_sphere(reference)
-    frame = framing(np.concatenate([m.positions for m in asset.meshes]))
-    source = MeshReference(in_frame(asset, *frame))
-    mesh = sphere(latent, (0.0, 0.0, 0.0), 0.93, maps)
-    model = Model(mesh, random_maps(maps, 0, True), frozenset(("shape", "normal", "material")), Rates())
-    return source, model, ViewSampler((0.0, 0.0, 0.0), 1.0)
 
 
 def projective(rows: dict) -> float:

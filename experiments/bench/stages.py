@@ -23,7 +23,7 @@ from appearance_opt.render.deferred import Grid
 from appearance_opt.render.freezing import Frozen
 from appearance_opt.render.gradient import Quality
 from appearance_opt.render.material import TexelLayer
-from experiments.bench.__main__ import set_up
+from experiments.bench.scene import set_up
 
 REPEATS = 15
 

@@ -1,0 +1,22 @@
+"""What the benchmarks fit."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from appearance_opt.fit.model import Model, Rates
+from appearance_opt.initial.sphere import random_maps, sphere
+from appearance_opt.jobs.simplify import in_frame
+from appearance_opt.reference.mesh import MeshReference
+from appearance_opt.views import ViewSampler, framing
+from scenes.analytic import bumpy_sphere
+
+
+def set_up(latent: int, reference: int, maps: int) -> tuple[MeshReference, Model, ViewSampler]:
+    """A bumpy sphere, and a smooth coarse one with random maps as its latent. ``latent``, ``reference``: triangles."""
+    asset = bumpy_sphere(reference)
+    frame = framing(np.concatenate([m.positions for m in asset.meshes]))
+    source = MeshReference(in_frame(asset, *frame))
+    mesh = sphere(latent, (0.0, 0.0, 0.0), 0.93, maps)
+    model = Model(mesh, random_maps(maps, 0, True), frozenset(("shape", "normal", "material")), Rates())
+    return source, model, ViewSampler((0.0, 0.0, 0.0), 1.0)
