@@ -15,23 +15,54 @@ def weld(positions: NDArray) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     return first, place.ravel()
 
 
+CANCELLED = 1e-6
+"""Unit vectors cancel when the length of their weighted sum is at most this share of the weights: rounding leaves
+1e-7 in single precision."""
+
+
 def vertex_normals(positions: NDArray, faces: NDArray, welded: bool = False) -> NDArray[np.float32]:
     """Angle-weighted unit normals (V, 3) (Thuermer and Wuethrich 1998).
 
     Vertices at the same place share their normal, so that UV seams do not show; pass ``welded`` when
-    there are none. A vertex that no face with area uses gets +Z.
+    there are none. A vertex that no face with area uses, or whose faces' normals cancel, gets +Z.
     """
+    out = summed_normals(positions, faces, welded)
+    out[~np.any(out, axis=1)] = (0.0, 0.0, 1.0)
+    return out
+
+
+def summed_normals(positions: NDArray, faces: NDArray, welded: bool = False) -> NDArray[np.float32]:
+    """The same, but zero where there is no such normal."""
     p = np.asarray(positions, np.float64)
     place = np.arange(len(p)) if welded else weld(positions)[1]
     corners = [p[faces[:, k]] for k in range(3)]
     normal = unit(np.cross(corners[1] - corners[0], corners[2] - corners[0]))
-    total = np.zeros((int(place.max()) + 1 if len(place) else 0, 3))
+    total = np.zeros((int(place.max()) + 1 if len(place) else 0, 4))
     for k in range(3):
         angle = corner_angle(corners[(k + 1) % 3] - corners[k], corners[(k + 2) % 3] - corners[k])
-        accumulate(total, place[faces[:, k]], normal * angle[:, None])
-    out = unit(total)[place]
-    out[~np.any(out, axis=1)] = (0.0, 0.0, 1.0)
-    return out.astype(np.float32)
+        accumulate(total, place[faces[:, k]], np.concatenate([normal, np.ones((len(normal), 1))], 1) * angle[:, None])
+    summed, weight = total[:, :3], total[:, 3]
+    summed[np.linalg.norm(summed, axis=1) <= CANCELLED * weight] = 0
+    return unit(summed)[place].astype(np.float32)
+
+
+def split_where_cancelled(
+    positions: NDArray, faces: NDArray, normals: NDArray
+) -> tuple[NDArray[np.intp], NDArray[np.int32], NDArray[np.float32]]:
+    """(vertex that each new vertex comes from, faces, normals) without zero normals (see ``summed_normals``): where
+    the two sides of a sheet share their vertices, each corner gets one of its own with the normal of its face."""
+    lost = ~np.any(normals, axis=1)
+    index = np.arange(len(positions))
+    face, corner = np.nonzero(lost[faces])
+    normals = np.where(lost[:, None], np.array((0, 0, 1), np.float32), normals)
+    if not len(face):
+        return index, faces, normals
+    a, b, c = (np.asarray(positions, np.float64)[faces[face, k]] for k in range(3))
+    own = unit(np.cross(b - a, c - a))
+    own[~np.any(own, axis=1)] = (0.0, 0.0, 1.0)
+    split = faces.astype(np.int32)
+    split[face, corner] = len(positions) + np.arange(len(face))
+    return np.concatenate([index, faces[face, corner]]), split, np.concatenate([normals, own]).astype(np.float32)
 
 
 def unit(v: NDArray) -> NDArray:

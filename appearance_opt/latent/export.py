@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from appearance_opt.asset.normals import vertex_normals
+from appearance_opt.asset.normals import split_where_cancelled, summed_normals
 from appearance_opt.asset.tangents import split_and_tangents
 from appearance_opt.asset.types import Asset, Material, Mesh, Texture
 
@@ -24,9 +24,10 @@ def to_asset(
     """One mesh, one material. ``positions`` (V, 3); ``maps``: natural values by channel name, images or
     numbers. Normals are angle weighted and tangents MikkTSpace's: what the renderer of the fit uses, so
     that the maps mean the same in another one."""
-    normals = vertex_normals(positions, mesh.faces, welded=True)
-    p, n, uv = positions[mesh.frame_vertex], normals[mesh.frame_vertex], mesh.uvs
-    faces, tangents = mesh.frame_faces, None
+    p, tangents = positions[mesh.frame_vertex], None
+    normals = summed_normals(positions, mesh.faces, welded=True)[mesh.frame_vertex]
+    index, faces, n = split_where_cancelled(p, mesh.frame_faces, normals)
+    p, uv = p[index], mesh.uvs[index]
     if np.ndim(maps.get("normal_x", 0.0)):
         index, faces, tangents = split_and_tangents(p, n, uv, faces)
         p, n, uv = p[index], n[index], uv[index]

@@ -12,13 +12,10 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from appearance_opt.asset.normals import CANCELLED
 from appearance_opt.render.math import at_least, unit
 
 TINY = 1e-20
-
-CANCELLED = 1e-6
-"""Unit vectors cancel when the length of their weighted sum is less than this share of the weights: rounding leaves
-about 1e-7, where multiplications and additions are fused."""
 
 
 @dataclass
@@ -34,8 +31,8 @@ class Corners:
 
 
 def vertex_normals(positions: mi.Float, corners: Corners) -> mi.Vector3f:
-    """Unit normals (V) of flat positions (3 V): face normals weighted by the corner's angle. A vertex
-    whose normals cancel, or that no face uses, gets +Z."""
+    """Unit normals (V) of flat positions (3 V): face normals weighted by the corner's angle. Zero at a vertex
+    whose normals cancel, or that no face uses: there, the face's own is taken (``render.surface``)."""
     p = [dr.gather(mi.Point3f, positions, i) for i in corners.vertex]
     normal = unit(dr.cross(p[1] - p[0], p[2] - p[0]))
     total = dr.zeros(mi.Float, dr.width(positions))
@@ -44,7 +41,7 @@ def vertex_normals(positions: mi.Float, corners: Corners) -> mi.Vector3f:
         angle = _angle(unit(p[(k + 1) % 3] - p[k]), unit(p[(k + 2) % 3] - p[k]))
         dr.scatter_add(total, normal * angle, corners.vertex[k])
         dr.scatter_add(weight, dr.detach(angle), corners.vertex[k])
-    return _direction(dr.unravel(mi.Vector3f, total), weight, mi.Vector3f(0, 0, 1))
+    return _direction(dr.unravel(mi.Vector3f, total), weight, mi.Vector3f(0))
 
 
 def tangent_frames(positions: mi.Float, normals: mi.Vector3f, corners: Corners) -> mi.Vector3f:
@@ -66,6 +63,7 @@ def tangent_frames(positions: mi.Float, normals: mi.Vector3f, corners: Corners) 
         dr.scatter_add(total, value, corners.frame[k])
         dr.scatter_add(weight, dr.detach(angle), corners.frame[k])
     n = dr.gather(mi.Vector3f, normals, corners.frame_vertex)
+    n = dr.select(dr.squared_norm(n) > 0, n, mi.Vector3f(0, 0, 1))
     fallback = dr.normalize(dr.cross(n, dr.select(dr.abs(n.x) < 0.9, mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0))))
     return _direction(dr.unravel(mi.Vector3f, total), weight, fallback)
 

@@ -9,7 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from appearance_opt.asset.normals import vertex_normals
+from appearance_opt.asset.normals import split_where_cancelled, summed_normals
 from appearance_opt.asset.tangents import any_tangent, split_and_tangents
 from appearance_opt.reference.textures import material_maps
 from appearance_opt.render import deferred, upload
@@ -168,10 +168,14 @@ def merge(asset: Asset, material_of: list[int], need_tangents: bool) -> MergedMe
 
 def _complete(mesh: Mesh, need_tangents: bool, need_colors: bool) -> MergedMesh:
     positions, faces = mesh.positions, mesh.faces
-    normals = vertex_normals(positions, faces) if mesh.normals is None else mesh.normals
+    normals = mesh.normals
     uvs = np.zeros((len(positions), 2), np.float32) if mesh.uvs is None else mesh.uvs
     colors = mesh.colors if mesh.colors is not None else np.ones((len(positions), 3), np.float32)
     tangents = mesh.tangents
+    if normals is None:
+        index, faces, normals = split_where_cancelled(positions, faces, summed_normals(positions, faces))
+        positions, uvs, colors = positions[index], uvs[index], colors[index]
+        tangents = None
     if need_tangents and tangents is None:
         if mesh.material.normal_texture is None or mesh.uvs is None:
             tangents = np.concatenate([any_tangent(normals), np.ones((len(normals), 1))], axis=1).astype(np.float32)

@@ -84,7 +84,7 @@ def interpolate(surface: Surface, camera: Camera, samples: Samples, resolution: 
     hit = Hit(dr.fma(d, depth, camera.eye), mi.Vector3f(0), d / -length, face[3])
     pixel = dr.detach(depth) * (2 * width / resolution) * dr.norm(camera.right)
     area = dr.square(pixel) / at_least(dr.abs(cosine), GRAZING_COSINE)
-    _attributes(hit, surface, samples.triangle, face, rows, b1, b2, dr.norm(facing), area)
+    _attributes(hit, surface, samples.triangle, face, rows, b1, b2, facing, area)
     # the back of a triangle is seen: turning the normal over also turns the bitangent, which the sign of
     # the handedness undoes
     back = cosine > 0
@@ -99,10 +99,10 @@ def interpolate_at(surface: Surface, triangle: mi.UInt32, b1: mi.Float, b2: mi.F
     point stands for, in world units squared. ``to_viewer`` is zero."""
     face, rows = _triangle(surface, triangle)
     p = [mi.Point3f(r[0], r[1], r[2]) for r in rows]
-    twice_area = dr.norm(dr.cross(p[1] - p[0], p[2] - p[0]))
+    facing = dr.cross(p[1] - p[0], p[2] - p[0])
     position = p[0] * (1 - b1 - b2) + p[1] * b1 + p[2] * b2
     hit = Hit(position, mi.Vector3f(0), mi.Vector3f(0), face[3])
-    _attributes(hit, surface, triangle, face, rows, b1, b2, twice_area, area)
+    _attributes(hit, surface, triangle, face, rows, b1, b2, facing, area)
     return hit
 
 
@@ -129,17 +129,19 @@ def _attributes(
     rows: list,
     b1: mi.Float,
     b2: mi.Float,
-    twice_area: mi.Float,
+    facing: mi.Vector3f,
     area: mi.Float,
 ) -> None:
     """Fill in the interpolated attributes of ``hit``: normal, and what the surface has of vertex colours,
-    texture coordinates and tangents. ``area`` of a sample on the surface becomes its UV footprint."""
+    texture coordinates and tangents. ``facing``: normal of the triangle by its winding, twice its area long; it is
+    taken where vertices have no normal. ``area`` of a sample on the surface becomes its UV footprint."""
     b0 = 1 - b1 - b2
 
     def mix(values: list) -> mi.Float:
         return dr.fma(values[0], b0, dr.fma(values[1], b1, values[2] * b2))
 
-    hit.normal = unit(mi.Vector3f(*(mix([v[c] for v in rows]) for c in (4, 5, 6))))
+    normal = unit(mi.Vector3f(*(mix([v[c] for v in rows]) for c in (4, 5, 6))))
+    hit.normal = dr.select(dr.squared_norm(normal) > 0, normal, unit(dr.detach(facing)))
     if surface.colors is not None:
         c = [_packet(surface.colors, face[k], 4) for k in range(3)]
         hit.color = mi.Color3f(*(mix([v[k] for v in c]) for k in range(3)))
@@ -152,7 +154,7 @@ def _attributes(
     hit.uv = mi.Point2f(mix([v[0] for v in f]), mix([v[1] for v in f]))
     a, b = (dr.detach(mi.Point2f(f[k][0] - f[0][0], f[k][1] - f[0][1])) for k in (1, 2))
     uv_area = dr.abs(a.x * b.y - a.y * b.x)
-    hit.footprint = area * uv_area / at_least(dr.detach(twice_area), 1e-30)
+    hit.footprint = area * uv_area / at_least(dr.norm(dr.detach(facing)), 1e-30)
     if surface.has_tangents:
         hit.tangent = unit(mi.Vector3f(*(mix([v[c] for v in f]) for c in (4, 5, 6))))
         hit.handedness = f[0][2]

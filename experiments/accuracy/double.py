@@ -6,15 +6,20 @@ import importlib
 import sys
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
+from typing import Any
 
 import mitsuba as mi
+
+
+def double_arrays() -> Any:
+    """Dr.Jit's array types of the device that Mitsuba's variant computes on."""
+    return importlib.import_module("drjit.cuda.ad" if mi.variant().startswith("cuda") else "drjit.llvm.ad")
 
 
 def in_double(module: ModuleType, **replaced: object) -> ModuleType:
     """The module's source executed once more, with double arrays where it says ``mi.Float`` and so on.
     ``replaced``: names of the module to set afterwards, e.g. functions it imports from another."""
-    cuda = mi.variant().startswith("cuda")
-    arrays = importlib.import_module("drjit.cuda.ad" if cuda else "drjit.llvm.ad")
+    arrays = double_arrays()
     three, two = arrays.Array3f64, arrays.Array2f64
     types = SimpleNamespace(
         Float=arrays.Float64, Bool=arrays.Bool, UInt32=arrays.UInt, Int32=arrays.Int,

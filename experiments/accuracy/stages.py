@@ -7,7 +7,6 @@ from types import SimpleNamespace
 from typing import Any
 
 import drjit as dr
-import drjit.llvm.ad as double_arrays
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +15,7 @@ from appearance_opt.fit import losses
 from appearance_opt.initial.sphere import sphere
 from appearance_opt.latent import mesh_ops
 from appearance_opt.render import brdf, coverage, rays, silhouette, surface
-from experiments.accuracy.double import in_double
+from experiments.accuracy.double import double_arrays, in_double
 
 COUNT = 200_000
 
@@ -47,9 +46,10 @@ class Precision:
 
     def __init__(self, double: bool) -> None:
         self.double = double
-        self.float = double_arrays.Float64 if double else mi.Float
-        self.three = double_arrays.Array3f64 if double else mi.Vector3f
-        self.color = double_arrays.Array3f64 if double else mi.Color3f
+        arrays = double_arrays()
+        self.float = arrays.Float64 if double else mi.Float
+        self.three = arrays.Array3f64 if double else mi.Vector3f
+        self.color = arrays.Array3f64 if double else mi.Color3f
         twin = in_double if double else (lambda m, **_: m)
         self.brdf, self.losses, self.mesh_ops, self.coverage = map(twin, (brdf, losses, mesh_ops, coverage))
         self.rays = twin(rays)
