@@ -68,17 +68,19 @@ def test_silhouettes_know_the_coverage_of_their_pixels() -> None:
     assert abs(error.mean()) < 3e-3
 
 
-def test_functions_in_single_precision_keep_their_digits() -> None:
+def test_functions_in_single_precision_keep_their_digits(variant: str) -> None:
+    # CUDA approximates quotients and roots: measured 6.0e-6 for the BRDF and 1.5e-4 for positions
+    device = 1 if variant.startswith("llvm") else 3
     worst = {(r.function, r.domain): r.largest for r in stages.lines()}
     # measured 1.5e-6 (1.2e-2 at roughness 0.08 while 1 - (n.h)^2 was taken as a difference)
-    assert max(v for (f, _), v in worst.items() if f == "brdf.reflect") < 5e-6
+    assert max(v for (f, _), v in worst.items() if f == "brdf.reflect") < 5e-6 * device
     # measured 6e-7 (2.5e-3 with log(x + 1))
     assert worst["losses.tone_map", "0 to 1e6"] < 3e-6
     # measured 1.5e-7 and 1.7e-7 (1.5e-4 and 2.1e-4 with the arc cosine)
     assert worst["mesh_ops.vertex_normals", "rough sphere"] < 1e-6
     assert worst["mesh_ops.tangent_frames", "rough sphere"] < 1e-6
     # measured 2.1e-5: rays of float32 pixel positions
-    assert worst["surface.interpolate, position", "triangles seen at a cosine of 0.2"] < 1e-4
+    assert worst["surface.interpolate, position", "triangles seen at a cosine of 0.2"] < 1e-4 * device
 
 
 @pytest.mark.parametrize("roughness", [0.0, 0.08, 0.3, 1.0])

@@ -79,7 +79,8 @@ def differences(
 
 
 @pytest.mark.parametrize(("samples", "balls"), [(1, 1), (4, 1), (1, 2), (4, 2)])
-def test_the_gradient_is_that_of_the_blended_image(samples: int, balls: int) -> None:
+def test_the_gradient_is_that_of_the_blended_image(samples: int, balls: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("appearance_opt.render.surface.EDGE_ON_COSINE", 1e-6)  # nothing is held back
     quality = replace(PAIRS, samples=samples)
     mesh = sphere(80, (0.1, 0.05, 0.0), 0.6, 16) if balls == 1 else two_balls()
     model, grid, views = white(mesh), Grid(2, 48), SAMPLER.draw(1, 2)
@@ -183,11 +184,13 @@ def test_surfaces_that_run_into_each_other_move_their_meeting_curve() -> None:
     target, truth = differences_along(problem, fields, 64)
     ours = Ours(problem, target, "log-srgb-l1")
     error = {}
-    for name, quality in (("pairs", replace(PAIRS, samples=4)), ("edges", Quality(8.0, 16, 4))):
+    edges = Quality(8.0, 16, 4)
+    qualities = {"pairs": replace(PAIRS, samples=4), "edges": edges, "both": replace(edges, meetings=True)}
+    for name, quality in qualities.items():
         g = ours(quality, 0)
         error[name] = error_of(np.einsum("vc,nvc->n", g, fields)[None], truth).relative
-    # measured 0.083 and 0.24: edges do not know that the curve moves
-    assert error["pairs"] < 0.1
+    # measured 0.083, 0.066 and 0.25: edges alone do not know that the curve moves
+    assert error["pairs"] < 0.1 and error["both"] < 0.1
     assert error["edges"] > 0.2
 
 

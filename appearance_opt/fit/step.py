@@ -71,8 +71,7 @@ class Gradients:
     ) -> None:
         self.model, self.grid, self.quality, self.loss = model, grid, quality, loss
         self.laplacians = laplacians or {}
-        walks = quality.visibility == "pairs"
-        self._edges = {level: t.walkable if walks else t.edges for level, t in model.topologies().items()}
+        self._edges = {level: t.walkable if quality.walks else t.edges for level, t in model.topologies().items()}
         self._run: Run = Frozen(model.fixed(), self.laplacians, grid, self._edges) if freeze else traced
 
     def __call__(self, inputs: StepInputs) -> tuple[mi.Float | None, dict[str, mi.Float]]:

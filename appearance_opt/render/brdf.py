@@ -19,6 +19,12 @@ ROUGHNESS_FLOOR = 0.08
 is smaller than a pixel and its gradient useless."""
 
 
+GRAZING_COSINE = 0.02
+"""Masking takes no flatter angles of light and viewer than this. Where both graze the surface, the highlight goes to
+zero within a range of angles as narrow as that, which hardly any ray meets: with 0.001, a ray that did had derivatives
+a hundred times as large as all others."""
+
+
 @dataclass
 class MaterialSample:
     """Material at each sample. ``base_color``: linear. ``normal``: tangent-space normal, not
@@ -43,8 +49,8 @@ def reflect(material: MaterialSample, n: mi.Vector3f, v: mi.Vector3f, l: mi.Vect
         f0 *= 1 - material.gamma
     diffuse = material.base_color * ((1 - material.metalness) * dr.inv_pi)
     h = unit(l + v)  # zero where the light is exactly behind: n.l is then below zero
-    nl = at_least(dr.dot(n, l), 0)
-    nv = at_least(dr.dot(n, v), 1e-3)
+    nl = dr.dot(n, l)
+    masked, nv = (at_least(x, GRAZING_COSINE) for x in (nl, dr.dot(n, v)))
     nh = clamp(dr.dot(n, h), 0, 1)
     vh = clamp(dr.dot(v, h), 0, 1)
     # (n.h)^2 (alpha^2 - 1) + 1 with the sine from the cross product: near the mirror direction of smooth
@@ -53,9 +59,9 @@ def reflect(material: MaterialSample, n: mi.Vector3f, v: mi.Vector3f, l: mi.Vect
     # of unit vectors it is never below alpha^2; n and h can be zero where normals cancel
     denominator = at_least(denominator, 0.5 * alpha2)
     distribution = alpha2 * dr.inv_pi / dr.square(denominator)
-    smith = nl * dr.sqrt(dr.fma(dr.square(nv), 1 - alpha2, alpha2))
-    smith += nv * dr.sqrt(dr.fma(dr.square(nl), 1 - alpha2, alpha2))
-    visibility = 0.5 / at_least(smith, 1e-6)
+    smith = masked * dr.sqrt(dr.fma(dr.square(nv), 1 - alpha2, alpha2))
+    smith += nv * dr.sqrt(dr.fma(dr.square(masked), 1 - alpha2, alpha2))
+    visibility = 0.5 / smith
     c = 1 - vh
     fresnel = dr.fma(1 - f0, dr.square(dr.square(c)) * c, f0)
-    return (dr.fma(-fresnel, diffuse, diffuse) + fresnel * (distribution * visibility)) * nl
+    return (dr.fma(-fresnel, diffuse, diffuse) + fresnel * (distribution * visibility)) * at_least(nl, 0)

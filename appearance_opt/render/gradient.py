@@ -49,7 +49,8 @@ class Quality:
     ``edge_density``: silhouette points per pixel of silhouette (0: none); ``edge_samples``: camera rays in each
     pixel that a silhouette crosses; both for "edges" only. ``samples``: rays in all (other) pixels; for "pairs" a
     square number, as neighbours are compared on a regular grid. ``sample_width``, ``point_width``: texture filter
-    in pixels of a pixel that is averaged, and of one that is a single point.
+    in pixels of a pixel that is averaged, and of one that is a single point. ``meetings``: "edges" follow surfaces
+    that run into each other, too, as pairs always do: neighbouring rays are compared, which costs about as much again.
     """
 
     edge_density: float = 1.0
@@ -58,12 +59,18 @@ class Quality:
     sample_width: float = 1.0
     point_width: float = 0.4
     visibility: str = "edges"
+    meetings: bool = False
 
     def __post_init__(self) -> None:
         if self.visibility not in VISIBILITY:
             raise ValueError(f"visibility '{self.visibility}' is none of {', '.join(VISIBILITY)}")
         if self.visibility == "pairs" and isqrt(self.samples) ** 2 != self.samples:
             raise ValueError(f"pairs need a square number of samples per pixel, not {self.samples}")
+
+    @property
+    def walks(self) -> bool:
+        """Are edge lists needed that can be walked over (``silhouette.walkable``)?"""
+        return self.visibility == "pairs" or self.meetings
 
 
 @dataclass
@@ -123,7 +130,11 @@ def render(
                 edges = silhouette.sample_edges(
                     scene, edge_list, surface.vertices, records, grid, quality.edge_density, seed, run
                 )
-            averaged, deferred, crossed = _camera_samples(scene, records, grid, edges, quality, defer, run)
+                if quality.meetings:
+                    per_axis = isqrt(quality.samples)
+                    met = pairs.meeting_points(scene, edge_list, surface.vertices, records, grid, per_axis, run)
+            crossing = [b.pixel for b in (edges, met) if b is not None]
+            averaged, deferred, crossed = _camera_samples(scene, records, grid, crossing, quality, defer, run)
         width = dr.opaque(mi.Float, filtered)
         # pairs blend what few rays miss; elsewhere the silhouette's line knows it
         corrected = quality.edge_samples if quality.visibility == "edges" else None
@@ -213,13 +224,19 @@ def backward(terms: list[mi.Float]) -> None:
 
 
 def _camera_samples(
-    scene: mi.Scene, records: mi.Float, grid: Grid, edges: EdgeSamples | None, quality: Quality, defer: bool, run: Run
+    scene: mi.Scene,
+    records: mi.Float,
+    grid: Grid,
+    crossing: list[mi.UInt32],
+    quality: Quality,
+    defer: bool,
+    run: Run,
 ) -> tuple[Weighted | None, Weighted | None, mi.UInt32 | None]:
-    """Covered camera rays, (averaged, deferred): ``samples`` in each pixel, ``edge_samples`` where a silhouette
-    passes; and the pixels where one does."""
+    """Covered camera rays, (averaged, deferred): ``samples`` in each pixel, ``edge_samples`` in those of ``crossing``,
+    where a boundary passes; and these pixels, each once."""
     on_edge = dr.zeros(mi.Bool, grid.pixels)
-    if edges is not None:
-        dr.scatter(on_edge, mi.Bool(True), edges.pixel)
+    for pixels in crossing:
+        dr.scatter(on_edge, mi.Bool(True), pixels)
     dr.eval(on_edge)
     pixel = (grid.view * grid.rows + grid.row) * grid.rows + grid.column
     parts, weights = [], []
@@ -235,7 +252,7 @@ def _camera_samples(
         deferred = _weighted(parts, None, grid, quality.point_width)
         parts, weights = [], []
     crossed = None
-    if edges is not None:
+    if crossing:
         place = dr.compress(dr.gather(mi.Bool, on_edge, pixel))
         crossed = dr.gather(mi.UInt32, pixel, place)
         parts.append(

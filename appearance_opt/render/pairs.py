@@ -116,6 +116,25 @@ def paired_samples(
     return Paired(averaged, deferred, dr.compress(changed), found.edges, found.meetings)
 
 
+def meeting_points(
+    scene: mi.Scene,
+    edges: EdgeList,
+    vertices: mi.Float,
+    records: mi.Float,
+    grid: Grid,
+    per_axis: int,
+    run: Run = traced,
+) -> Meetings | None:
+    """Where surfaces run into each other, found between ``per_axis`` squared rays in every pixel, and nothing else of
+    what pairs find: for other estimators of the derivative at silhouettes. None without any."""
+    fine = _Fine(grid.finer(per_axis), grid, per_axis)
+    s = fine.samples
+    hits, depth = run(_middles, scene, records, s.view, s.column, s.row, s.size)
+    dr.eval(hits, depth)
+    found = find_pairs(edges, vertices, records, hits, depth, fine, run)
+    return None if found is None else found.meetings
+
+
 def _middles(
     scene: mi.Scene, records: mi.Float, view: mi.UInt32, column: mi.UInt32, row: mi.UInt32, size: mi.Float
 ) -> tuple[Samples, mi.Float]:

@@ -7,12 +7,17 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from appearance_opt.render.math import at_least, clamp, unit
+from appearance_opt.render.math import at_least, at_most, clamp, unit
 from appearance_opt.render.rays import Camera, Samples, direction
 
 GRAZING_COSINE = 0.2
 """Mip levels are chosen as if no surface were seen at a flatter angle than this: isotropic lookups at
 grazing angles would otherwise blur everything along the short axis of the footprint, too."""
+
+EDGE_ON_COSINE = 0.05
+"""Surfaces seen at a flatter angle pass on less of the derivative of the place that a ray hits, in proportion. It grows
+with the inverse of the cosine while the chance of a ray to hit falls with the cosine: the few that do would drown all
+others in noise."""
 
 SLACK = 0.1
 """How far barycentric coordinates may lie outside of the triangle that was hit: rounding of healthy triangles moves
@@ -81,6 +86,9 @@ def interpolate(surface: Surface, camera: Camera, samples: Samples, resolution: 
     facing = dr.detach(dr.cross(e1, e2))
     length = dr.norm(d)
     cosine = dr.dot(facing, d) / (length * at_least(dr.norm(facing), 1e-30))
+    if dr.grad_enabled(b1, b2, depth):
+        share = at_most(dr.abs(cosine) * (1 / EDGE_ON_COSINE), 1)
+        b1, b2, depth = (dr.detach(x) + share * (x - dr.detach(x)) for x in (b1, b2, depth))
     hit = Hit(dr.fma(d, depth, camera.eye), mi.Vector3f(0), d / -length, face[3])
     pixel = dr.detach(depth) * (2 * width / resolution) * dr.norm(camera.right)
     area = dr.square(pixel) / at_least(dr.abs(cosine), GRAZING_COSINE)

@@ -43,7 +43,9 @@ SETTINGS = {
     "edges 1, 4 rays": Quality(1.0, 4, 1),
     "edges 2, 4 rays": Quality(2.0, 4, 1),
     "edges 4, 8 rays": Quality(4.0, 8, 1),
+    "edges 4, 8 rays, meetings": Quality(4.0, 8, 1, meetings=True),
     "edges 8, 16 rays, 2 x 2": Quality(8.0, 16, 4),
+    "edges 8, 16 rays, 2 x 2, meetings": Quality(8.0, 16, 4, meetings=True),
     "edges 16, 64 rays, 4 x 4": Quality(16.0, 64, 16),
 }
 """Edges: silhouette points per pixel of silhouette, rays per pixel that a silhouette crosses, rays in the others."""
@@ -82,12 +84,13 @@ def main() -> None:
     parser.add_argument("--force", action="store_true")
     parser.add_argument("--new-references", action="store_true")
     parser.add_argument("--plot", action="store_true")
+    parser.add_argument("--device", default="cpu", choices=("cpu", "cuda"))
     arguments = parser.parse_args()
     name = "vertices" if arguments.sizes is None else "sizes"
     if arguments.loss != "log-srgb-l1":
         name += f"_{arguments.loss}"
     if not arguments.plot:
-        backend.select("cpu")
+        backend.select(arguments.device)
         mitsuba_peer.register()
         path = OUT / f"{name}.csv"
         cases = [(s, 128) for s in arguments.scenes or problem_names()]
