@@ -92,7 +92,8 @@ def grown(
     positions, faces = decimate(source.merged.positions, source.merged.faces, triangles)
     if not len(faces):
         raise InputError("nothing is left of the grown mesh at that budget; ask for more triangles")
-    return transferred(source, unwrap(positions, faces, options.texture_size), options), result.interrupted
+    start = transferred(source, unwrap(positions, faces, options.texture_size), options)
+    return replace(start, grown=True), result.interrupted
 
 
 def mended(
@@ -172,7 +173,7 @@ def kept(path: Path, fingerprint: str, make: Callable[[], tuple[Start, bool]]) -
     start, interrupted = make()
     arrays = {name: getattr(start.mesh, name) for name in _MESH}
     arrays.update({f"map/{name}": np.asarray(value) for name, value in start.maps.items()})
-    archive.write(path, fingerprint, {**arrays, "known": start.known})
+    archive.write(path, fingerprint, {**arrays, "known": start.known, "grown": np.asarray(start.grown)})
     return start, interrupted
 
 
@@ -181,4 +182,5 @@ _MESH = ("positions", "faces", "frame_vertex", "frame_faces", "uvs")
 
 def _start(arrays: dict[str, NDArray]) -> Start:
     maps = {k[4:]: v if v.ndim else float(v) for k, v in arrays.items() if k.startswith("map/")}
-    return Start(LatentMesh(*(arrays[name] for name in _MESH)), maps, True, arrays["known"])
+    mesh = LatentMesh(*(arrays[name] for name in _MESH))
+    return Start(mesh, maps, True, arrays["known"], grown=bool(arrays["grown"]))

@@ -46,7 +46,8 @@ TIGHT_TRIANGLES = 10_000
 class Start:
     """``maps``: channel name -> image or number; ``relative``: may the Laplacian keep this shape?
     ``known``: texels whose values mean something. ``levels``: tessellation levels at which it is drawn;
-    ``finest``: the displaced mesh of the finest one, None without displacement."""
+    ``finest``: the displaced mesh of the finest one, None without displacement. ``grown``: was it found by fitting
+    (from a sphere)?"""
 
     mesh: LatentMesh
     maps: dict[str, NDArray | float]
@@ -54,6 +55,7 @@ class Start:
     known: NDArray[np.bool_]
     levels: tuple[int, ...] = (0,)
     finest: LatentMesh | None = None
+    grown: bool = False
 
     @property
     def drawn(self) -> LatentMesh:
