@@ -50,7 +50,7 @@ class Quality:
     pixel that a silhouette crosses; both for "edges" only. ``samples``: rays in all (other) pixels; for "pairs" a
     square number, as neighbours are compared on a regular grid. ``sample_width``, ``point_width``: texture filter
     in pixels of a pixel that is averaged, and of one that is a single point. ``meetings``: "edges" follow surfaces
-    that run into each other, too, as pairs always do: neighbouring rays are compared, which costs about as much again.
+    that run into each other, too, as pairs always do, by comparing neighbouring rays (price: docs/accuracy.md).
     """
 
     edge_density: float = 1.0
