@@ -10,6 +10,7 @@ import sys
 import time
 from pathlib import Path
 
+import mitsuba as mi
 import numpy as np
 import pytest
 
@@ -17,6 +18,7 @@ from appearance_opt.asset import load, save
 from appearance_opt.asset.types import Asset
 from appearance_opt.errors import InputError
 from appearance_opt.jobs.simplify import check_paths
+from appearance_opt.render.freezing import Frozen
 
 JOB = [
     "simplify", "in.glb", "--triangles", "150", "--texture-size", "32", "--resolution", "32",
@@ -119,6 +121,22 @@ def test_killed_runs_leave_no_broken_files(job: tuple[Path, float], tmp_path: Pa
 
 def test_interrupted_runs_end_cleanly(job: tuple[Path, float], tmp_path: Path) -> None:
     interrupt(job, tmp_path, np.array([0.3, 0.6, 0.9]))
+
+
+def test_an_interrupted_recording_is_an_interrupt() -> None:
+    run = Frozen()
+
+    def stopped(x: mi.Float) -> mi.Float:
+        del x
+        raise KeyboardInterrupt
+
+    def squared(x: mi.Float) -> mi.Float:
+        return x * x
+
+    with pytest.raises(KeyboardInterrupt):
+        run(stopped, mi.Float(1, 2))
+    for _ in range(2):  # recorded, then replayed: nothing of the other one is left
+        np.testing.assert_array_equal(run(squared, mi.Float(2, 3)), [4, 9])
 
 
 @pytest.mark.slow

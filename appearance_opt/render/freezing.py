@@ -45,6 +45,11 @@ class Frozen:
         gc.disable()
         try:
             return self._frozen[function](*arguments)
+        except RuntimeError as error:
+            # what stops a recording reaches us as an error of Dr.Jit's: Ctrl-C must stay Ctrl-C
+            if isinstance(error.__cause__, KeyboardInterrupt):
+                raise KeyboardInterrupt from None
+            raise
         finally:
             if collecting:
                 gc.enable()
