@@ -107,7 +107,8 @@ def interrupt(job: tuple[Path, float], tmp_path: Path, moments: np.ndarray) -> N
         process = start(tmp_path, "--out", f"low{k}.glb")
         code, error = stopped_at(process, max(share * seconds, 0.5), signal.SIGINT)
         assert "Traceback" not in error and "Exception ignored" not in error, error
-        assert code in (0, 130), error
+        # a shell says 130 for both: Python ends itself by the signal where a C extension's code was interrupted
+        assert code in (0, 130, -signal.SIGINT), error
         if code == 0:
             assert (tmp_path / f"low{k}.glb").exists()
         else:  # before the fit, or in the instant after the result was renamed

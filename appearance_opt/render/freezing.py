@@ -46,8 +46,7 @@ class Frozen:
         try:
             return self._frozen[function](*arguments)
         except RuntimeError as error:
-            # what stops a recording reaches us as an error of Dr.Jit's: Ctrl-C must stay Ctrl-C
-            if isinstance(error.__cause__, KeyboardInterrupt):
+            if _interrupted(error):
                 raise KeyboardInterrupt from None
             raise
         finally:
@@ -57,6 +56,15 @@ class Frozen:
     def recordings(self) -> int:
         """Recordings made so far."""
         return sum(f.n_recordings for f in self._frozen.values())
+
+
+def _interrupted(error: BaseException | None) -> bool:
+    """Was it Ctrl-C that Dr.Jit reports as an error, or as the cause of one, of a recording or of its arguments?"""
+    while error is not None:
+        if isinstance(error, KeyboardInterrupt):
+            return True
+        error = error.__cause__
+    return False
 
 
 def traced(function: Callable, *arguments: Any) -> Any:
