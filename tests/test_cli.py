@@ -44,7 +44,7 @@ def test_simplify_and_compare_as_a_user_would(ball: Asset, tmp_path: Path) -> No
         (["simplify", "ball.glb", "--triangles", "10", "--out", "ball.glb"], "is the input itself"),
         (["simplify", "ball.glb", "--triangles", "10", "--out", "x.fbx"], "cannot write '.fbx'"),
         (["simplify", "ball.glb", "--triangles", "10", "--out", "ball.glb/x.glb"], "not a folder"),
-        (["simplify", "ball.glb", "--triangles", "ten", "--out", "x.glb"], "valid int"),
+        (["simplify", "ball.glb", "--triangles", "ten", "--out", "x.glb"], "valid integer"),
         (["simplify", "ball.glb", "--triangles", "10", "--out", "x.glb", "--fit", "shap"], "did you mean 'shape'"),
         (["simplify", "ball.glb", "--triangles", "10", "--out", "x.glb", "--budget", "soon"], "not a time"),
         (["simplify", "ball.glb", "--triangles", "10", "--out", "x.glb", "--config", "bad.toml"], "did you mean"),
