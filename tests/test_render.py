@@ -187,6 +187,6 @@ def test_a_pair_is_the_image_near_outlines_and_points_elsewhere(ball: Asset) -> 
     np.testing.assert_allclose(average[outline], full[outline], rtol=1e-4, atol=1e-5)
     inside = average[..., 3] == points[..., 3]
     same = (average == points).all(axis=-1)
-    # towards the rim depth changes by more than 2 % over five pixels (measured 0.87)
-    assert same[~outline].mean() > 0.8 and not same[outline].all()
+    # a slanted surface is no outline, although depths five pixels apart differ by more than 2 % there
+    assert same[~outline].mean() > 0.95 and not same[outline].all()
     assert inside[~outline].all()

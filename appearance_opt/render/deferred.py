@@ -107,8 +107,8 @@ def render_image(
 DISCONTINUITY = 1.02
 """Ratio of depths between neighbouring pixels from which an outline may pass between them."""
 
-OUTLINE_REACH = 2
-"""Pixels around an outline that are sampled finely: where a fitted shape's outline may lie meanwhile."""
+OUTLINE_REACH = 1
+"""Pixels beyond the two at a jump that are sampled finely, too: where a fitted shape's outline may lie meanwhile."""
 
 
 def render_pair(
@@ -173,28 +173,38 @@ def _without_outlines(
 
 
 def _near_outlines(hits: Samples, depth: mi.Float, rows: mi.UInt32, pixels: int) -> mi.Bool:
-    """(pixels,) pixels with a jump in depth, or a border of the object, within ``OUTLINE_REACH``: where the largest
-    depth of a square of pixels exceeds the smallest, each found along rows first, then along columns."""
+    """(pixels,) pixels beside a jump in depth or a border of the object, and all within ``OUTLINE_REACH`` of them.
+    Only neighbours in a row or column are compared: further apart, the depths of any slanted surface differ."""
     far = dr.select(hits.triangle == rays.MISS, mi.Float(1e30), depth)
     image = dr.zeros(mi.Float, pixels)
     dr.scatter(image, far, pixel_index(hits, rows), mode=dr.ReduceMode.Permute)
+    dr.eval(image)
     i = dr.arange(mi.UInt32, pixels)
     line = i // rows
     column, row = i - line * rows, line % rows
+    axes = (column, mi.UInt32(1)), (row, rows)
     nearest = farthest = image
-    for place, stride in ((column, mi.UInt32(1)), (row, rows)):
-        dr.eval(nearest, farthest)
-        least, most = nearest, farthest
+    for place, stride in axes:
+        for neighbour in _neighbours(i, place, stride, rows, 1):
+            at = dr.gather(mi.Float, image, neighbour)
+            nearest, farthest = dr.fmin(nearest, at), dr.fmax(farthest, at)
+    near = farthest > DISCONTINUITY * nearest
+    for place, stride in axes:  # a square: along rows first, then along columns
+        dr.eval(near)
+        before = near
         for away in range(1, OUTLINE_REACH + 1):
-            after, before = (place + away < rows, i + away * stride), (place >= away, i - away * stride)
-            for inside, neighbour in (after, before):
-                at = dr.select(inside, neighbour, i)
-                least = dr.fmin(least, dr.gather(mi.Float, nearest, at))
-                most = dr.fmax(most, dr.gather(mi.Float, farthest, at))
-        nearest, farthest = least, most
-    near_outline = farthest > DISCONTINUITY * nearest
-    dr.eval(near_outline)
-    return near_outline
+            for neighbour in _neighbours(i, place, stride, rows, away):
+                near |= dr.gather(mi.Bool, before, neighbour)
+    dr.eval(near)
+    return near
+
+
+def _neighbours(
+    i: mi.UInt32, place: mi.UInt32, stride: mi.UInt32, rows: mi.UInt32, away: int
+) -> tuple[mi.UInt32, mi.UInt32]:
+    """The pixels ``away`` after and before pixels ``i`` along an axis; ``i`` itself beyond the border of the image."""
+    after = dr.select(place + away < rows, i + away * stride, i)
+    return after, dr.select(place >= away, i - away * stride, i)
 
 
 def _with_shaded(
