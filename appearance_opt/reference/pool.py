@@ -114,8 +114,11 @@ class ReferencePool:
                 self._views[group * self.batch + k] = views[k : k + 1]
 
     def _keep(self, kept: dict[int, NDArray[np.float16]], group: int, images: NDArray[np.float32]) -> None:
-        # NumPy takes ten times as long to halve the precision
-        halved = np.array(mi.Float16(dr.minimum(to_device(checked(images, f"pool batch {group}")), LARGEST)))
+        # on the device: NumPy takes ten times as long to halve the precision
+        radiance = to_device(images)
+        if not dr.all(dr.isfinite(radiance) & (radiance >= 0)):
+            checked(images, f"pool batch {group}")
+        halved = np.array(mi.Float16(dr.minimum(radiance, LARGEST)))
         kept.update(enumerate(halved.reshape(self.batch, -1), group * self.batch))
 
 

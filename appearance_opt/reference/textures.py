@@ -21,7 +21,7 @@ _FULL = (*_PLAIN, "normal_x", "normal_y", "normal_z")
 
 
 def material_maps(materials: list[Material]) -> MaterialMaps:
-    """Maps of all materials in one pyramid, or constants when the only material has no texture.
+    """Maps of all materials in one pyramid of half precision, or constants when the only material has no texture.
 
     Maps of one material that differ in size are brought to the largest of them.
     """
@@ -34,7 +34,7 @@ def material_maps(materials: list[Material]) -> MaterialMaps:
     bases = [_packed(m, channels is _FULL) for m in materials]
     # a material's maps share one wrap mode here: horizontal wrap of its first texture
     wraps = [_WRAP[_textures(m)[0].wrap[0]] if _textures(m) else REPEAT for m in materials]
-    return MaterialMaps((TexelLayer(channels, build_pyramid(bases, wraps)),))
+    return MaterialMaps((TexelLayer(channels, build_pyramid(bases, wraps).halved()),))
 
 
 def _textures(m: Material) -> list[Texture]:
