@@ -147,6 +147,7 @@ LEVERS = (
     Lever("views seen 8 times", "reference", _reuse(8), core=False),
     Lever("views seen twice", "reference", _reuse(2), core=False),
     Lever("views seen once", "reference", _reuse(1), core=False),
+    Lever("4 rays at its outlines", "reference", lambda s: replace(s, pool_samples=4), core=False),
     Lever("32 rays at its outlines", "reference", lambda s: replace(s, pool_samples=32), core=False),
     Lever("points 2/5 as wide", "reference", _wider(0.4), core=False),
     Lever("no silhouette gradient", "visibility", _quality(0.0, 1)),
