@@ -6,6 +6,7 @@ surface's buffers and the texels; visibility is not (see ``silhouette`` for its 
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import drjit as dr
@@ -78,6 +79,17 @@ def pixel_index(samples: Samples, resolution: mi.UInt32) -> mi.UInt32:
     return (samples.view * resolution + row) * resolution + column
 
 
+@dataclass(frozen=True)
+class Drawing:
+    """What is drawn, and from where. ``records``: see ``Views.records``; ``size``, ``rows``: see ``Grid``."""
+
+    surface: Surface
+    maps: MaterialMaps
+    records: mi.Float
+    size: mi.Float
+    rows: mi.UInt32
+
+
 def render_image(
     scene: mi.Scene,
     surface: Surface,
@@ -94,13 +106,14 @@ def render_image(
     Returns (pixels * 4) premultiplied linear radiance and coverage. One sample of all pixels at a time,
     so that memory does not grow with ``samples``.
     """
+    drawing = Drawing(surface, maps, records, grid.size, grid.rows)
     filtered = samples**-0.5 if width is None else width
     image = dr.zeros(mi.Float, grid.pixels * 4)
     for dx, dy in rays.sub_pixel_offsets(samples):
         hits, _, covered = _seen(scene, records, grid, dx, dy, run)
         # one sample per pixel in each pass: no two threads meet
         mode = dr.ReduceMode.NoConflicts
-        image = _with_shaded(image, surface, maps, records, grid, hits, covered, 1 / samples, filtered, mode, run)
+        image = _with_shaded(image, drawing, hits, covered, 1 / samples, filtered, mode, run)
     return image
 
 
@@ -124,18 +137,17 @@ def render_pair(
     """(average, points): two images of the same views. ``points`` is what the ray through the middle of each pixel
     sees, textures filtered over ``width`` pixels; ``average`` is the same away from outlines, and the mean of
     ``samples`` rays near them. Costs a fraction of ``samples`` full images. ``run``: as in ``render_image``."""
+    drawing = Drawing(surface, maps, records, grid.size, grid.rows)
     hits, depth, covered = _seen(scene, records, grid, 0.5, 0.5, run)
     points, mode = dr.zeros(mi.Float, grid.pixels * 4), dr.ReduceMode.NoConflicts
-    points = _with_shaded(points, surface, maps, records, grid, hits, covered, 1.0, width, mode, run)
+    points = _with_shaded(points, drawing, hits, covered, 1.0, width, mode, run)
     average, outlined = run(_without_outlines, points, hits, depth, grid.rows, grid.pixels)
     dr.eval(average, outlined)
     index = dr.compress(outlined)
     if dr.width(index):
         fine = rays.trace_pixels(scene, records, grid.view, grid.column, grid.row, index, samples, grid.size, run)
         every, mode = dr.arange(mi.UInt32, dr.width(fine.triangle)), dr.ReduceMode.Local
-        average = _with_shaded(
-            average, surface, maps, records, grid, fine, every, 1 / samples, samples**-0.5, mode, run
-        )
+        average = _with_shaded(average, drawing, fine, every, 1 / samples, samples**-0.5, mode, run)
     return average, points
 
 
@@ -209,10 +221,7 @@ def _neighbours(
 
 def _with_shaded(
     image: mi.Float,
-    surface: Surface,
-    maps: MaterialMaps,
-    records: mi.Float,
-    grid: Grid,
+    drawing: Drawing,
     hits: Samples,
     index: mi.UInt32,
     weight: float,
@@ -224,28 +233,23 @@ def _with_shaded(
     ``weight`` of its pixel."""
     if dr.width(index) == 0:
         return image
-    share, filtered = dr.opaque(mi.Float, weight), dr.opaque(mi.Float, width)
-    out = run(_added, image, surface, maps, records, hits, index, share, filtered, grid.size, grid.rows, mode)
+    out = run(_added, image, drawing, hits, index, dr.opaque(mi.Float, weight), dr.opaque(mi.Float, width), mode)
     dr.eval(out)
     return out
 
 
 def _added(
     image: mi.Float,
-    surface: Surface,
-    maps: MaterialMaps,
-    records: mi.Float,
+    drawing: Drawing,
     hits: Samples,
     index: mi.UInt32,
     weight: mi.Float,
     width: mi.Float,
-    size: mi.Float,
-    rows: mi.UInt32,
     mode: dr.ReduceMode,
 ) -> mi.Float:
     some = rays.keep(hits, index)
-    color = shade(surface, maps, records, some, size, width)
+    color = shade(drawing.surface, drawing.maps, drawing.records, some, drawing.size, width)
     value = mi.ArrayXf([color.x * weight, color.y * weight, color.z * weight, weight])
     out = mi.Float(image)
-    dr.scatter_reduce(dr.ReduceOp.Add, out, value, pixel_index(some, rows), mode=mode)
+    dr.scatter_reduce(dr.ReduceOp.Add, out, value, pixel_index(some, drawing.rows), mode=mode)
     return out
