@@ -35,7 +35,7 @@ time, and slower. Early rounds, far from the budget, can be bolder: what they co
 EARLY = 6
 """Rounds are early while there are more than this many times the budget of triangles."""
 
-BOLD, LARGE = 16, 200_000
+BOLD, LARGE = 8, 20_000
 """Rounds are bold while there are more than this many times the budget of triangles, and more than ``LARGE``: smaller
 meshes are quick anyway."""
 
