@@ -59,12 +59,13 @@ BLOCK = 1 << 15
 @dataclass
 class _State:
     """The mesh between rounds. ``quadrics``: (V, 10); ``faces``: live faces only; ``blocked``: edges whose
-    collapse is illegal as long as the faces around them do not change."""
+    collapse is illegal as long as the faces around them do not change; ``part``: see ``_parts``."""
 
     positions: NDArray[np.float64]
     quadrics: NDArray[np.float64]
     faces: NDArray[np.int64]
     blocked: NDArray[np.int64]
+    part: NDArray | None = None
 
 
 def decimate(
@@ -283,33 +284,41 @@ def _collapse(state: _State, edges: NDArray, target: NDArray) -> None:
     state.blocked = state.blocked[~(gone | near[state.blocked >> 32] | near[state.blocked & 0xFFFFFFFF])]
 
 
-def _parts(faces: NDArray) -> tuple[NDArray, NDArray, NDArray]:
-    """(vertices that faces use (U,), connected part of each (U,), part of each face (F,)). Other vertices do not
-    count: near the budget they are most."""
+def _parts(state: _State) -> NDArray:
+    """(V,) the connected part that each vertex belongs to. Found once: collapses neither join parts nor split them."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
-    used, f = np.unique(faces, return_inverse=True)
-    f = f.reshape(-1, 3)
-    graph = coo_matrix((np.ones(2 * len(f)), (f[:, [0, 1]].ravel(), f[:, [1, 2]].ravel())), (len(used), len(used)))
-    part = connected_components(graph, directed=False)[1]
-    return used, part, part[f[:, 0]]
+    if state.part is None:
+        n, f = len(state.positions), state.faces
+        ends = f[:, [0, 1]].ravel(), f[:, [1, 2]].ravel()
+        graph = coo_matrix((np.ones(2 * len(f)), ends), (n, n))
+        state.part = connected_components(graph, directed=False)[1]
+    return state.part
 
 
 def _drop_cheap_parts(state: _State, triangles: int, price: float) -> None:
     """Remove connected parts whose loss costs less than their triangles are worth elsewhere: ``price`` for every two.
     No part collapses to nothing, so that many small ones would take what the large ones need."""
-    used, part, of_face = _parts(state.faces)
+    part = _parts(state)
+    of_face = part[state.faces[:, 0]]
     count = np.bincount(of_face)
+    here = np.flatnonzero(count)
+    if len(here) == 1:
+        return
+    alive = np.zeros(len(part), bool)
+    alive[state.faces.ravel()] = True
+    used = np.flatnonzero(alive)
     low, high = np.full((len(count), 3), np.inf), np.full((len(count), 3), -np.inf)
-    np.minimum.at(low, part, state.positions[used])
-    np.maximum.at(high, part, state.positions[used])
+    np.minimum.at(low, part[used], state.positions[used])
+    np.maximum.at(high, part[used], state.positions[used])
     q = state.quadrics[used]
-    weight = np.bincount(part, q[:, 0] + q[:, 3] + q[:, 5])
-    cost = LOST * np.sqrt(weight) * np.sum((high - low) ** 2, axis=1) * 2 / count
+    weight = np.bincount(part[used], q[:, 0] + q[:, 3] + q[:, 5])
+    squared_diameter = np.sum((high[here] - low[here]) ** 2, axis=1)
+    cost = LOST * np.sqrt(weight[here]) * squared_diameter * 2 / count[here]
     order = np.argsort(cost)
     excess = len(state.faces) - triangles
-    gone = order[(cost[order] < price) & (np.cumsum(count[order]) <= excess)]
+    gone = here[order[(cost[order] < price) & (np.cumsum(count[here[order]]) <= excess)]]
     gone = gone[weight[gone] < weight.max()]
     state.faces = state.faces[~np.isin(of_face, gone)]
 
@@ -317,7 +326,7 @@ def _drop_cheap_parts(state: _State, triangles: int, price: float) -> None:
 def _drop_smallest_parts(state: _State, triangles: int) -> None:
     """Remove whole connected parts, the smallest first, until the budget is met."""
     f = state.faces
-    _, _, of_face = _parts(f)
+    of_face = _parts(state)[f[:, 0]]
     p = state.positions[f]
     area = np.linalg.norm(np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]), axis=1)
     count = np.bincount(of_face)
