@@ -239,46 +239,24 @@ def _camera_samples(
         dr.scatter(on_edge, mi.Bool(True), pixels)
     dr.eval(on_edge)
     pixel = (grid.view * grid.rows + grid.row) * grid.rows + grid.column
-    parts, weights = [], []
-    for dx, dy in rays.sub_pixel_offsets(quality.samples):
-        offset = dr.opaque(mi.Float, dx), dr.opaque(mi.Float, dy)
-        hits, inside = run(
-            _hits, scene, records, grid.view, grid.column, grid.row, grid.size, grid.rows, *offset, on_edge
-        )
-        parts.append(rays.keep(hits, dr.compress(inside)))
-        weights.append(1 / quality.samples)
+    on_edge = dr.gather(mi.Bool, on_edge, pixel)
+    dr.eval(on_edge, pixel)
+
+    def rays_in(places: mi.UInt32, count: int) -> Samples:
+        return rays.trace_pixels(scene, records, grid.view, grid.column, grid.row, places, count, grid.size, run)
+
+    parts, weights = [rays_in(dr.compress(~on_edge), quality.samples)], [1 / quality.samples]
     deferred = None
     if defer and quality.samples == 1:
         deferred = _weighted(parts, None, grid, quality.point_width)
         parts, weights = [], []
     crossed = None
     if crossing:
-        place = dr.compress(dr.gather(mi.Bool, on_edge, pixel))
-        crossed = dr.gather(mi.UInt32, pixel, place)
-        parts.append(
-            rays.trace_pixels(
-                scene, records, grid.view, grid.column, grid.row, place, quality.edge_samples, grid.size, run
-            )
-        )
+        places = dr.compress(on_edge)
+        crossed = dr.gather(mi.UInt32, pixel, places)
+        parts.append(rays_in(places, quality.edge_samples))
         weights.append(1 / quality.edge_samples)
     return _weighted(parts, weights, grid, quality.sample_width), deferred, crossed
-
-
-def _hits(
-    scene: mi.Scene,
-    records: mi.Float,
-    view: mi.UInt32,
-    column: mi.UInt32,
-    row: mi.UInt32,
-    size: mi.Float,
-    rows: mi.UInt32,
-    dx: mi.Float,
-    dy: mi.Float,
-    on_edge: mi.Bool,
-) -> tuple[Samples, mi.Bool]:
-    """What the ray at the offset (dx, dy) in every pixel hits, and whether it hits, away from silhouettes."""
-    hits = rays.trace(scene, records, view, mi.Float(column) + dx, mi.Float(row) + dy, size)
-    return hits, (hits.triangle != MISS) & ~dr.gather(mi.Bool, on_edge, pixel_index(hits, rows))
 
 
 def _weighted(parts: list[Samples], weights: list[float] | None, grid: Grid, width_of_one: float) -> Weighted | None:

@@ -115,6 +115,8 @@ def trace_pixels(
     run: Run = traced,
 ) -> Samples:
     """The hits among ``count`` rays in each of the pixels at the positions ``index`` of (view, column, row)."""
+    if dr.width(index) == 0:
+        return Samples(mi.UInt32(), mi.Float(), mi.Float(), mi.UInt32())
     ray = dr.arange(mi.UInt32, dr.width(index) * count)
     dr.eval(ray)  # its length varies: it is no part of what is recorded
     fine, covered = run(_in_pixels, scene, records, view, column, row, index, ray, count, resolution)
