@@ -10,10 +10,12 @@ import numpy as np
 import pytest
 
 from appearance_opt.asset.types import Asset, Material, Mesh, Texture
+from appearance_opt.latent.texels import TexelCodec
 from appearance_opt.reference.mesh import MeshReference
 from appearance_opt.render import brdf
 from appearance_opt.render.brdf import MaterialSample
 from appearance_opt.render.deferred import Grid
+from appearance_opt.render.math import angle_of
 from appearance_opt.render.texture import CLAMP, MIRROR, REPEAT, build_pyramid
 from appearance_opt.views import ViewSampler, framing, look_at
 
@@ -87,6 +89,45 @@ def test_mip_levels_average_and_blend() -> None:
     level1 = texels.reshape(4, 2, 4, 2, 2).mean(axis=(1, 3))
     centre = pyramid.lookup(None, mi.Point2f(mi.Float([0.625]), mi.Float([0.375])), mi.Float([4 / 64]))[0]
     assert float(centre[0]) == pytest.approx(float(level1[1, 2, 0]), abs=1e-5)
+
+
+def test_textures_in_half_precision_are_off_by_its_rounding() -> None:
+    rng = np.random.default_rng(3)
+    texels = rng.random((32, 32, 8)).astype(np.float32)
+    texels[0, 0] = 1e6
+    pyramid = build_pyramid([texels], [CLAMP])
+    uv = mi.Point2f(*rng.random((2, 1000)).astype(np.float32))
+    footprint = mi.Float((10 ** rng.uniform(-4, 0, 1000)).astype(np.float32))
+    single, half = (np.array(mi.ArrayXf(p.lookup(None, uv, footprint))) for p in (pyramid, pyramid.halved()))
+    within = np.abs(single).max(axis=0) < 1
+    assert within.sum() > 500
+    np.testing.assert_allclose(half[:, within], single[:, within], rtol=2**-11)
+    corner = pyramid.halved().lookup(None, mi.Point2f(mi.Float([0.0]), mi.Float([0.0])), mi.Float([0.0]))
+    assert float(corner[0][0]) == 65504.0  # the largest number that there is, not infinity
+
+
+def test_angles_are_those_of_the_arc_tangent() -> None:
+    true = np.concatenate([np.linspace(1e-6, np.pi, 10_001), np.pi * np.arange(1, 8) / 8, 10.0 ** np.arange(-7, 0)])
+    sine, cosine = (mi.Float(f(true).clip(1e-12 if f is np.sin else -1).astype(np.float32)) for f in (np.sin, np.cos))
+    dr.enable_grad(sine, cosine)
+    angle = angle_of(sine, cosine)
+    exact = np.arctan2(np.array(sine).astype(np.float64), np.array(cosine).astype(np.float64))
+    np.testing.assert_allclose(np.array(angle), exact, rtol=3e-7)
+    dr.backward(angle)
+    # the derivative of the arc tangent: (cosine, -sine) over their squared length
+    np.testing.assert_allclose(np.array(dr.grad(sine)), np.array(cosine), atol=1e-5)
+    np.testing.assert_allclose(np.array(dr.grad(cosine)), -np.array(sine), atol=1e-5)
+
+
+def test_a_fitted_pyramid_is_that_of_the_decoded_values() -> None:
+    rng = np.random.default_rng(4)
+    maps = {n: rng.random((16, 16)).astype(np.float32) for n in ("red", "normal_x", "roughness")}
+    codec = TexelCodec(tuple(maps), 16)
+    ours = codec.layer(codec.encode(maps)).pyramid
+    bounded = np.stack([maps["red"], maps["normal_x"], maps["roughness"].clip(0.08), 0 * maps["red"]], axis=-1)
+    expected = build_pyramid([bounded], [CLAMP])
+    assert ours.layout == expected.layout
+    np.testing.assert_allclose(np.array(ours.texels), np.array(expected.texels), atol=1e-6)
 
 
 def test_several_materials_share_one_buffer(ball: Asset) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING
 
 import drjit as dr
@@ -68,7 +69,7 @@ def exposed(scene: mi.Scene, position: mi.Point3f, normal: mi.Vector3f, active: 
         dr.eval(p, n, hidden)
         for x, y in sub_pixel_offsets(count):
             # the same directions everywhere: what is hidden is of one piece
-            d = n if number == 0 else mi.warp.square_to_uniform_sphere(dr.opaque(mi.Point2f, (float(x), float(y))))
+            d = n if number == 0 else dr.opaque(mi.Vector3f, _on_sphere(float(x), float(y)))
             side = dr.select(dr.dot(d, n) < 0, mi.Float(-LIFT), mi.Float(LIFT))
             hidden &= scene.ray_test(mi.Ray3f(dr.fma(n, side, p), d, length, 0, mi.Color0f()), active=hidden)
             dr.eval(hidden)
@@ -76,6 +77,14 @@ def exposed(scene: mi.Scene, position: mi.Point3f, normal: mi.Vector3f, active: 
         left = dr.gather(mi.UInt32, left, dr.compress(hidden))
         dr.eval(out, left)
     return out
+
+
+def _on_sphere(u: float, v: float) -> tuple[float, float, float]:
+    """Unit vector of a point of the unit square, area to area (that of ``mi.warp`` needs LLVM 17: see
+    ``render/math.py``)."""
+    z = 1 - 2 * v
+    radius, azimuth = math.sqrt(max(1 - z * z, 0.0)), 2 * math.pi * u
+    return radius * math.cos(azimuth), radius * math.sin(azimuth), z
 
 
 def _hash(x: mi.UInt32) -> mi.UInt32:

@@ -13,7 +13,7 @@ import drjit as dr
 import mitsuba as mi
 
 from appearance_opt.asset.normals import CANCELLED
-from appearance_opt.render.math import at_least, unit
+from appearance_opt.render.math import angle_of, at_least, unit
 
 TINY = 1e-20
 
@@ -95,4 +95,4 @@ def _angle(a: mi.Vector3f, b: mi.Vector3f) -> mi.Float:
     """Angle between vectors, as exact for thin corners as for wide ones (the arc cosine loses half of its digits
     there), with a finite derivative for parallel ones."""
     sine = dr.sqrt(at_least(dr.squared_norm(dr.cross(a, b)), 1e-16))
-    return dr.atan2(sine, dr.dot(a, b))
+    return angle_of(sine, dr.dot(a, b))

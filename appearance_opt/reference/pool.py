@@ -12,6 +12,7 @@ import numpy as np
 from appearance_opt.backend import to_device
 from appearance_opt.errors import ReferenceRenderError
 from appearance_opt.reference.base import PointReference
+from appearance_opt.render.math import LARGEST_HALF, at_most
 from appearance_opt.views import Views
 
 if TYPE_CHECKING:
@@ -19,10 +20,6 @@ if TYPE_CHECKING:
 
     from appearance_opt.reference.base import Reference
     from appearance_opt.views import ViewSampler
-
-
-LARGEST = float(np.finfo(np.float16).max)
-"""Brightest radiance that is kept."""
 
 
 @dataclass(frozen=True)
@@ -118,7 +115,7 @@ class ReferencePool:
         radiance = to_device(images)
         if not dr.all(dr.isfinite(radiance) & (radiance >= 0)):
             checked(images, f"pool batch {group}")
-        halved = np.array(mi.Float16(dr.minimum(radiance, LARGEST)))
+        halved = np.array(mi.Float16(at_most(radiance, LARGEST_HALF)))
         kept.update(enumerate(halved.reshape(self.batch, -1), group * self.batch))
 
 

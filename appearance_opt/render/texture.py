@@ -14,7 +14,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from appearance_opt.render.math import at_least, at_most
+from appearance_opt.render.math import LARGEST_HALF, at_least, at_most, clamp
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -22,9 +22,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 REPEAT, CLAMP, MIRROR = 0, 1, 2
-
-LARGEST_HALF = 65504.0
-"""Largest number in half precision."""
 
 
 @dataclass(frozen=True)
@@ -100,7 +97,7 @@ class Pyramid:
 
     def halved(self) -> Pyramid:
         """The same in half precision (11 bits): half the memory, which is what lookups wait for."""
-        texels = mi.Float16(dr.clip(self.texels, -LARGEST_HALF, LARGEST_HALF))
+        texels = mi.Float16(clamp(self.texels, -LARGEST_HALF, LARGEST_HALF))
         dr.eval(texels)
         return replace(self, texels=texels)
 
