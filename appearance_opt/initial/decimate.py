@@ -315,10 +315,11 @@ def _drop_cheap_parts(state: _State, triangles: int, price: float) -> None:
     q = state.quadrics[used]
     weight = np.bincount(part[used], q[:, 0] + q[:, 3] + q[:, 5])
     squared_diameter = np.sum((high[here] - low[here]) ** 2, axis=1)
-    cost = LOST * np.sqrt(weight[here]) * squared_diameter * 2 / count[here]
+    cost = np.full(len(count), np.inf)  # of what is gone already
+    cost[here] = LOST * np.sqrt(weight[here]) * squared_diameter * 2 / count[here]
     order = np.argsort(cost)
     excess = len(state.faces) - triangles
-    gone = here[order[(cost[order] < price) & (np.cumsum(count[here[order]]) <= excess)]]
+    gone = order[(cost[order] < price) & (np.cumsum(count[order]) <= excess)]
     gone = gone[weight[gone] < weight.max()]
     state.faces = state.faces[~np.isin(of_face, gone)]
 
