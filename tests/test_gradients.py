@@ -246,9 +246,12 @@ def test_a_mesh_out_of_sight_has_no_gradient_and_breaks_nothing() -> None:
     assert all((np.array(g) == 0).all() for g in grads.values())
 
 
-def test_pixels_shaded_with_their_loss_have_the_gradient_of_the_whole_image() -> None:
-    """The shortcut for pixels of one sample against the path through the image."""
-    model, grid, quality = make_model(), Grid(2, 48), Quality(1.0, 4, 1, sample_width=0.4)
+@pytest.mark.parametrize(("samples", "visibility"), [(1, "edges"), (2, "edges"), (2, "none"), (4, "none")])
+def test_pixels_shaded_with_their_loss_have_the_gradient_of_the_whole_image(samples: int, visibility: str) -> None:
+    """The shortcut for pixels of few samples against the path through the image. Without silhouettes some pixels are
+    covered in part."""
+    model, grid = make_model(), Grid(2, 48)
+    quality = Quality(1.0, 4, samples, sample_width=0.4, visibility=visibility)
     inputs = make_inputs(model, grid, 1)
     loss = LOSSES["log-srgb-l1"]
     value, quick = Gradients(model, grid, quality, loss, freeze=False)(inputs)

@@ -64,8 +64,8 @@ class Drawn:
         self.topology = LatentTopology(mesh, tangents) if self.tessellator is None else self.tessellator.topology
         drawn = self.topology.mesh
         self.edge_length = local_edge_length(drawn.positions, drawn.faces)
-        self.scene = upload.scene_of(drawn.positions, drawn.faces)
-        self._parameters = mi.traverse(self.scene)
+        self._moving = upload.MovingScene(drawn.positions, drawn.faces)
+        self.scene = self._moving.scene
 
     def pose(self, shape: Shape) -> mi.Float:
         """Flat positions (3 N) of the drawn mesh; differentiable."""
@@ -73,8 +73,7 @@ class Drawn:
 
     def move(self, posed: mi.Float) -> None:
         """Rebuild the BVH at the given positions."""
-        self._parameters["mesh.vertex_positions"] = posed
-        self._parameters.update()
+        self._moving.move(posed)
 
 
 class Model:

@@ -94,7 +94,8 @@ class Gradients:
         averaged, by_image = None, dr.zeros(mi.Float, 4 * grid.pixels)
         if some is not None and dr.width(some):
             averaged, by_image = run(image_loss, self.loss, target, frame.image, some, grid.pixels)
-        points = inputs.reference.points
+        # what one ray saw is compared with one ray
+        points = inputs.reference.points if self.quality.samples == 1 else None
         direct, out = run(
             self._pulled_back,
             model.level,

@@ -8,7 +8,7 @@ samples again, with gradients, and pulls back
 
 everything but the surface's buffers held fixed. The image itself is never differentiated.
 
-Most pixels hold one sample and no silhouette: their colour is that of the sample. When the loss is a sum over
+Most pixels hold no silhouette, and a few samples: their colour is the mean of these. When the loss is a sum over
 pixels, ``render(..., defer=True)`` leaves them out, and ``direct`` shades them, takes the loss and goes back in
 one kernel: half the work.
 """
@@ -30,7 +30,7 @@ from appearance_opt.render.meetings import Meetings
 from appearance_opt.render.rays import MISS, Samples
 from appearance_opt.render.silhouette import EdgeList, EdgeSamples
 from appearance_opt.render.surface import Surface
-from appearance_opt.render.weighted import Weighted, concat, joined
+from appearance_opt.render.weighted import Weighted, Whole, concat, joined
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -39,6 +39,9 @@ if TYPE_CHECKING:
 
 
 VISIBILITY = ("edges", "pairs", "none")
+
+DEFERRED = 4
+"""Samples per pixel up to which pixels are deferred: the kernel shades each of them in code of its own."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +82,7 @@ class Frame:
 
     ``image``: (pixels * 4) premultiplied linear radiance and coverage, without the deferred pixels.
     ``averaged``: the covered camera rays that are averaged in it; ``deferred``: those that are not in the image
-    yet, each the only one of its pixel; None without any. ``crossed``: indices of the pixels that a silhouette
+    yet, all of their pixels; None without any. ``crossed``: indices of the pixels that a silhouette
     crosses; ``edges``: its visible points, None without any; ``contrast``: c_in - c_out at them, premultiplied RGB
     and coverage. ``meetings``, ``meetings_contrast``: the same of surfaces that run into each other, which only pairs
     see.
@@ -89,7 +92,7 @@ class Frame:
     records: mi.Float
     image: mi.Float
     averaged: Weighted | None
-    deferred: Weighted | None
+    deferred: Whole | None
     crossed: mi.UInt32 | None
     edges: EdgeSamples | None
     contrast: mi.ArrayXf | None
@@ -118,7 +121,8 @@ def render(
     run: Run = traced,
 ) -> Frame:
     """Forward pass, without gradients (``surface`` and ``maps`` are read detached). With ``defer``, pixels of
-    a single sample are not shaded but left to ``direct``. ``run``: how its stages are called (see ``freezing``)."""
+    few samples that no silhouette crosses are not shaded but left to ``direct``. ``run``: how its stages are called
+    (see ``freezing``)."""
     with dr.suspend_grad():
         edges, met, filtered = None, None, 1.0
         if quality.visibility == "pairs" and edge_list is not None:
@@ -184,7 +188,8 @@ def direct(
     if frame.deferred is None:
         return None
     d = frame.deferred
-    return pixel_loss(shade(surface, maps, frame.records, d.samples, frame.grid.size, d.width), d.pixel)
+    colors = [shade(surface, maps, frame.records, r, frame.grid.size, d.width) for r in d.rays]
+    return pixel_loss(sum(colors[1:], colors[0]) * (1 / len(colors)), d.pixel)
 
 
 def surrogate(
@@ -231,7 +236,7 @@ def _camera_samples(
     quality: Quality,
     defer: bool,
     run: Run,
-) -> tuple[Weighted | None, Weighted | None, mi.UInt32 | None]:
+) -> tuple[Weighted | None, Whole | None, mi.UInt32 | None]:
     """Covered camera rays, (averaged, deferred): ``samples`` in each pixel, ``edge_samples`` in those of ``crossing``,
     where a boundary passes; and these pixels, each once."""
     on_edge = dr.zeros(mi.Bool, grid.pixels)
@@ -242,37 +247,58 @@ def _camera_samples(
     on_edge = dr.gather(mi.Bool, on_edge, pixel)
     dr.eval(on_edge, pixel)
 
-    def rays_in(places: mi.UInt32, count: int) -> Samples:
-        return rays.trace_pixels(scene, records, grid.view, grid.column, grid.row, places, count, grid.size, run)
+    def rays_in(places: mi.UInt32, count: int) -> tuple[Samples, mi.Bool]:
+        return rays.trace_every(scene, records, grid.view, grid.column, grid.row, places, count, grid.size, run)
 
-    parts, weights = [rays_in(dr.compress(~on_edge), quality.samples)], [1 / quality.samples]
-    deferred = None
-    if defer and quality.samples == 1:
-        deferred = _weighted(parts, None, grid, quality.point_width)
-        parts, weights = [], []
-    crossed = None
+    fine, covered = rays_in(dr.compress(~on_edge), quality.samples)
+    deferred, others = None, covered
+    if defer and quality.samples <= DEFERRED:
+        deferred, others = _whole_pixels(fine, covered, grid, quality)
+    parts, weights, crossed = [], [], None
+    if others is not None:
+        parts, weights = [rays.keep(fine, dr.compress(others))], [1 / quality.samples]
     if crossing:
         places = dr.compress(on_edge)
         crossed = dr.gather(mi.UInt32, pixel, places)
-        parts.append(rays_in(places, quality.edge_samples))
+        fine, covered = rays_in(places, quality.edge_samples)
+        parts.append(rays.keep(fine, dr.compress(covered)))
         weights.append(1 / quality.edge_samples)
     return _weighted(parts, weights, grid, quality.sample_width), deferred, crossed
 
 
-def _weighted(parts: list[Samples], weights: list[float] | None, grid: Grid, width_of_one: float) -> Weighted | None:
-    """Lists of samples as one; each list has its weight (None: one)."""
-    parts_weights = [(p, w) for p, w in zip(parts, weights or [1.0] * len(parts), strict=True) if dr.width(p.triangle)]
-    if not parts_weights:
+def _whole_pixels(fine: Samples, covered: mi.Bool, grid: Grid, quality: Quality) -> tuple[Whole | None, mi.Bool | None]:
+    """(the pixels whose rays are all ``covered``, which other rays are: None of one per pixel). ``fine``: as from
+    ``rays.trace_every``."""
+    count, others = quality.samples, None
+    if count == 1:
+        first = dr.compress(covered)
+    else:
+        whole = dr.full(mi.Bool, True, dr.width(covered) // count)
+        start = dr.arange(mi.UInt32, dr.width(whole)) * count
+        for k in range(count):
+            whole &= dr.gather(mi.Bool, covered, start + k)
+        dr.eval(whole)
+        first = dr.compress(whole) * count
+        others = covered & ~dr.gather(mi.Bool, whole, dr.arange(mi.UInt32, dr.width(covered)) // count)
+    if dr.width(first) == 0:
+        return None, others
+    every = [rays.keep(fine, first + k) for k in range(count)]
+    pixel = pixel_index(every[0], grid.rows)
+    width = quality.point_width if count == 1 else quality.sample_width * count**-0.5
+    dr.eval(every, pixel)
+    return Whole(every, pixel, dr.opaque(mi.Float, width)), others
+
+
+def _weighted(parts: list[Samples], weights: list[float], grid: Grid, width_of_one: float) -> Weighted | None:
+    """Lists of samples as one; each list has its weight."""
+    there = [(p, w) for p, w in zip(parts, weights, strict=True) if dr.width(p.triangle)]
+    if not there:
         return None
-    samples = concat([p for p, _ in parts_weights])
-    width = dr.opaque(mi.Float, width_of_one)
+    samples = concat([p for p, _ in there])
+    weight = joined([dr.full(mi.Float, w, dr.width(p.triangle)) for p, w in there])
     pixel = pixel_index(samples, grid.rows)
-    if weights is None:
-        dr.eval(samples, pixel)
-        return Weighted(samples, pixel, None, width)
-    weight = joined([dr.full(mi.Float, w, dr.width(p.triangle)) for p, w in parts_weights])
     dr.eval(samples, weight, pixel)
-    return Weighted(samples, pixel, weight, dr.sqrt(weight) * width)
+    return Weighted(samples, pixel, weight, dr.sqrt(weight) * dr.opaque(mi.Float, width_of_one))
 
 
 def _contrast(

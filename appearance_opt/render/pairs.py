@@ -36,7 +36,7 @@ from appearance_opt.render.meetings import Meetings
 from appearance_opt.render.rays import MISS, Samples
 from appearance_opt.render.silhouette import EdgeList, EdgeSamples
 from appearance_opt.render.walk import Neighbours, choose, neighbours, walk
-from appearance_opt.render.weighted import Weighted, concat, joined
+from appearance_opt.render.weighted import Weighted, Whole, concat, joined
 
 if TYPE_CHECKING:
     from appearance_opt.render.freezing import Run
@@ -63,7 +63,7 @@ class Paired:
     (``crossed``), and the moving boundaries."""
 
     averaged: Weighted | None
-    deferred: Weighted | None
+    deferred: Whole | None
     crossed: mi.UInt32 | None
     edges: EdgeSamples | None = None
     meetings: Meetings | None = None
@@ -144,7 +144,7 @@ def _middles(
 
 def _weights(
     hits: Samples, received: mi.Float, found: Pairs | None, fine: _Fine, quality: Quality, defer: bool
-) -> tuple[Weighted | None, Weighted | None]:
+) -> tuple[Weighted | None, Whole | None]:
     """Every covered sample in its own pixel, less what it receives, and the givers in the pixels of the receivers."""
     own = rays.keep(hits, dr.compress(hits.triangle != MISS))
     if dr.width(own.triangle) == 0:
@@ -156,7 +156,7 @@ def _weights(
         alone = dr.compress(share == 0)
         if dr.width(alone):
             points = rays.keep(own, alone)
-            deferred = Weighted(points, pixel_index(points, rows), None, dr.opaque(mi.Float, quality.point_width))
+            deferred = Whole([points], pixel_index(points, rows), dr.opaque(mi.Float, quality.point_width))
         changed = dr.compress(share > 0)
         own, share = rays.keep(own, changed), dr.gather(mi.Float, share, changed)
     parts = []

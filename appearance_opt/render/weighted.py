@@ -12,12 +12,22 @@ from appearance_opt.render.rays import Samples
 
 @dataclass
 class Weighted:
-    """Covered camera rays, the ``pixel`` of each and its ``weight`` there (None: one), and their ``width`` in
-    pixels, which selects mip levels."""
+    """Covered camera rays, the ``pixel`` of each and its ``weight`` there, and their ``width`` in pixels, which selects
+    mip levels."""
 
     samples: Samples
     pixel: mi.UInt32
-    weight: mi.Float | None
+    weight: mi.Float
+    width: mi.Float
+
+
+@dataclass
+class Whole:
+    """Pixels all of whose camera rays are covered: the first ray of every ``pixel``, the second, and so on, each worth
+    the same, and their ``width`` in pixels."""
+
+    rays: list[Samples]
+    pixel: mi.UInt32
     width: mi.Float
 
 
