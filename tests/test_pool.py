@@ -7,7 +7,7 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from appearance_opt.reference.pool import ReferencePool
+from appearance_opt.reference.pool import FIRST, ReferencePool
 from appearance_opt.views import Views, ViewSampler
 
 SAMPLER = ViewSampler((0.0, 0.0, 0.0), 1.0, seed=3)
@@ -43,6 +43,17 @@ def test_views_are_seen_as_often_as_asked(reuse: int) -> None:
     assert np.mean(list(counts.values())) == pytest.approx(reuse, rel=0.1)
     assert pool.reference.rendered == pytest.approx(iterations * BATCH / reuse, rel=0.1)
     assert len(pool._images) <= CAPACITY
+
+
+def test_a_large_pool_is_not_filled_before_its_views_are_used() -> None:
+    pool = ReferencePool(Counting(), SAMPLER, 40 * BATCH, BATCH, 4, 1, reuse=4)
+    rendered = []
+    for batch in range(200):
+        pool.draw(batch)
+        rendered.append(pool.reference.rendered // BATCH)
+    assert rendered[:FIRST] == list(range(1, FIRST + 1))
+    assert rendered[-1] == FIRST + (200 - FIRST) // 4
+    assert len(pool._images) == 40 * BATCH
 
 
 def test_views_stay_if_asked() -> None:

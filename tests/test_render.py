@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from scipy.ndimage import maximum_filter
 
 from appearance_opt.asset.types import Asset, Material, Mesh, Texture
 from appearance_opt.latent.texels import TexelCodec
@@ -217,7 +218,7 @@ def test_textures_of_one_material_may_differ_in_size(ball: Asset) -> None:
     assert image[..., 3].max() == 1
 
 
-def test_a_pair_is_the_image_near_outlines_and_points_elsewhere(ball: Asset) -> None:
+def test_a_pair_is_the_image_at_outlines_and_points_elsewhere(ball: Asset) -> None:
     reference = MeshReference(ball)
     views = ViewSampler((0.0, 0.0, 0.0), 1.0, seed=2).draw(0, 2)
     average, points = reference.pair(views, 192, 16, 0.4)
@@ -226,8 +227,18 @@ def test_a_pair_is_the_image_near_outlines_and_points_elsewhere(ball: Asset) -> 
     outline = (full[..., 3] > 0) & (full[..., 3] < 1)
     assert outline.sum() > 100
     np.testing.assert_allclose(average[outline], full[outline], rtol=1e-4, atol=1e-5)
-    inside = average[..., 3] == points[..., 3]
-    same = (average == points).all(axis=-1)
+    assert not (average == points).all(axis=-1)[outline].any()
+    assert (average[..., 3] == points[..., 3])[~outline].all()
+    same, lit = (average == points).all(axis=-1), full[..., :3].min(axis=-1) > 0
+
+    def within(reach: int) -> np.ndarray:
+        return np.stack([maximum_filter(view, 2 * reach + 1) for view in outline])
+
+    # around an outline, where a fitted shape's may lie, fewer rays are averaged
+    around = within(4) & ~within(2) & (full[..., 3] == 1) & lit
+    assert around.sum() > 1000
+    assert not same[around].any()
+    assert 1e-6 < np.abs(average - full)[around].max() < 5e-3
     # a slanted surface is no outline, although depths five pixels apart differ by more than 2 % there
-    assert same[~outline].mean() > 0.95 and not same[outline].all()
-    assert inside[~outline].all()
+    assert same[~within(8)].all()
+    assert within(8).mean() < 0.4

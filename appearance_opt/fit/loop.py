@@ -33,6 +33,9 @@ log = logging.getLogger(__name__)
 MAX_BAD_STEPS = 10
 """Consecutive steps with non-finite gradients after which a fit gives up."""
 
+LOOKING = 0.1
+"""Largest part of a time budget that is spent on looking at the held-out views: short fits look less often."""
+
 LOSS_EVERY = 8
 """Steps between two evaluations of the loss: it is only shown, the gradient does not need it."""
 
@@ -173,11 +176,23 @@ class _Run:
                 state.laplacian = options.laplacian * done.loss / 0.01
         state.iteration += 1
         if self.clock.progress(state.iteration) >= self.next_look and not self.clock.done(state.iteration):
-            self.look()
-            self.next_look += options.validate_every
+            self._next_look(self._timed_look())
         self._report()
         if self.checkpointer is not None and self.checkpointer.due():
             self.save()
+
+    def _timed_look(self) -> float:
+        """Seconds that a look takes."""
+        began = self.clock.time()
+        self.look()
+        return self.clock.time() - began
+
+    def _next_look(self, seconds: float) -> None:
+        """When to look again after a look that took ``seconds``."""
+        self.next_look += self.options.validate_every
+        if self.options.seconds:
+            pause = seconds / (LOOKING * self.options.seconds)
+            self.next_look = max(self.next_look, self.clock.progress(self.state.iteration) + pause)
 
     def look(self) -> None:
         """Render the held-out views; remember the state if it is the best so far."""

@@ -22,6 +22,10 @@ if TYPE_CHECKING:
     from appearance_opt.views import ViewSampler
 
 
+FIRST = 8
+"""Batches that are new one after the other at the beginning."""
+
+
 @dataclass(frozen=True)
 class Targets:
     """Reference images of a batch, flat (batch * pixels * 4): ``average`` over the pixels' areas, and what the rays
@@ -33,12 +37,13 @@ class Targets:
 
 @dataclass
 class ReferencePool:
-    """``capacity`` views drawn from ``sampler`` at a time, their images rendered when first asked for.
+    """At most ``capacity`` views drawn from ``sampler`` at a time, their images rendered when first asked for.
 
-    The first pass sees new views in every iteration. From then on every ``reuse``-th iteration does, and its views
-    take the place of the oldest ones; the others draw at random from those that are there. So each view is seen
-    about ``reuse`` times (0: views stay for ever, which is for references that are slow): enough to spare most of the
-    rendering, and few enough that maps of a million texels are not fitted to the noise of a few hundred images.
+    The first iterations see new views, ``FIRST`` batches of them. From then on every ``reuse``-th iteration does, and
+    its views take the place of the oldest ones as soon as ``capacity`` is reached; the others draw at random from those
+    that are there. So each view is seen about ``reuse`` times: enough to spare most of the rendering, and few enough
+    that maps of a million texels are not fitted to the noise of a few hundred images. With 0, which is for references
+    that are slow, a first pass sees ``capacity`` views, which then stay for ever.
 
     Which views an iteration sees is a pure function of the seed and the iteration: a resumed fit sees the same,
     and re-renders what it needs. Images are kept in half precision.
@@ -59,13 +64,14 @@ class ReferencePool:
     def draw(self, iteration: int) -> tuple[Views, Targets]:
         """The views of an iteration and their images."""
         newest, fresh = self._newest(iteration)
+        oldest = max(newest - self._groups + 1, 0)
         if fresh:  # a whole batch at a time
             members = np.arange(self.batch) + newest * self.batch
         else:
             rng = np.random.default_rng([self.sampler.seed, self.sampler.stream, iteration, 1])
-            oldest = newest - self._groups + 1
-            members = oldest * self.batch + rng.choice(self._groups * self.batch, self.batch, replace=False)
-        self._forget((newest - self._groups + 1) * self.batch)
+            there = (newest - oldest + 1) * self.batch
+            members = oldest * self.batch + rng.choice(there, self.batch, replace=False)
+        self._forget(oldest * self.batch)
         missing = [int(k) for k in members if int(k) not in self._images]
         if missing:
             self._render(sorted({k // self.batch for k in missing}))
@@ -80,17 +86,18 @@ class ReferencePool:
 
     @property
     def _groups(self) -> int:
-        """Batches that are there at a time."""
+        """Batches that are there at a time, at most."""
         return max(1, self.capacity // self.batch)
 
     def _newest(self, iteration: int) -> tuple[int, bool]:
         """(number of the newest batch, does the iteration see that one?)"""
-        later = iteration - self._groups
+        first = self._groups if self.reuse == 0 else min(FIRST, self._groups)
+        later = iteration - first
         if later < 0:
             return iteration, True
         if self.reuse == 0:
-            return self._groups - 1, False
-        return self._groups + later // self.reuse, later % self.reuse == 0
+            return first - 1, False
+        return first + later // self.reuse, later % self.reuse == 0
 
     def _forget(self, first: int) -> None:
         """Drop views with numbers below ``first``."""

@@ -121,7 +121,11 @@ DISCONTINUITY = 1.02
 """Ratio of depths between neighbouring pixels from which an outline may pass between them."""
 
 OUTLINE_REACH = 1
-"""Pixels beyond the two at a jump that are sampled finely, too: where a fitted shape's outline may lie meanwhile."""
+"""Pixels beyond the two at a jump that are sampled as finely."""
+
+BAND_REACH, BAND_SHARE = 0.02, 0.5
+"""Pixels up to this part of the image's width from a jump, where a fitted shape's outlines may lie meanwhile, are
+sampled, too: by this part of the rays."""
 
 
 def render_pair(
@@ -136,18 +140,22 @@ def render_pair(
 ) -> tuple[mi.Float, mi.Float]:
     """(average, points): two images of the same views. ``points`` is what the ray through the middle of each pixel
     sees, textures filtered over ``width`` pixels; ``average`` is the same away from outlines, and the mean of
-    ``samples`` rays near them. Costs a fraction of ``samples`` full images. ``run``: as in ``render_image``."""
+    ``samples`` rays at them, of fewer around them. Costs a fraction of ``samples`` full images. ``run``: as in
+    ``render_image``."""
     drawing = Drawing(surface, maps, records, grid.size, grid.rows)
     hits, depth, covered = _seen(scene, records, grid, 0.5, 0.5, run)
     points, mode = dr.zeros(mi.Float, grid.pixels * 4), dr.ReduceMode.NoConflicts
     points = _with_shaded(points, drawing, hits, covered, 1.0, width, mode, run)
-    average, outlined = run(_without_outlines, points, hits, depth, grid.rows, grid.pixels)
-    dr.eval(average, outlined)
-    index = dr.compress(outlined)
-    if dr.width(index):
-        fine = rays.trace_pixels(scene, records, grid.view, grid.column, grid.row, index, samples, grid.size, run)
+    band = max(round(BAND_REACH * grid.resolution) - OUTLINE_REACH, 0)
+    average, at, around = run(_without_outlines, points, hits, depth, grid.rows, grid.pixels, band)
+    dr.eval(average, at, around)
+    for outlined, count in ((at, samples), (around, max(round(BAND_SHARE * samples), 1))):
+        index = dr.compress(outlined)
+        if dr.width(index) == 0:
+            continue
+        fine = rays.trace_pixels(scene, records, grid.view, grid.column, grid.row, index, count, grid.size, run)
         every, mode = dr.arange(mi.UInt32, dr.width(fine.triangle)), dr.ReduceMode.Local
-        average = _with_shaded(average, drawing, fine, every, 1 / samples, samples**-0.5, mode, run)
+        average = _with_shaded(average, drawing, fine, every, 1 / count, count**-0.5, mode, run)
     return average, points
 
 
@@ -176,47 +184,60 @@ def _traced_at(
 
 
 def _without_outlines(
-    points: mi.Float, hits: Samples, depth: mi.Float, rows: mi.UInt32, pixels: int
-) -> tuple[mi.Float, mi.Bool]:
-    """(the image ``points`` with zeros in the pixels near outlines, whether the pixel of each of ``hits`` is one)."""
-    near = _near_outlines(hits, depth, rows, pixels)
-    image = dr.select(dr.gather(mi.Bool, near, dr.arange(mi.UInt32, pixels * 4) // 4), 0, points)
-    return image, dr.gather(mi.Bool, near, pixel_index(hits, rows))
+    points: mi.Float, hits: Samples, depth: mi.Float, rows: mi.UInt32, pixels: int, band: int
+) -> tuple[mi.Float, mi.Bool, mi.Bool]:
+    """(the image ``points`` with zeros in the pixels at outlines and around them; for each of ``hits``: is it at one?
+    Is it one of the ``band`` pixels around?)"""
+    raster = _Raster(rows, pixels)
+    at = raster.grown(_jumps(hits, depth, raster), OUTLINE_REACH)
+    every = raster.grown(at, band)
+    image = dr.select(dr.gather(mi.Bool, every, dr.arange(mi.UInt32, pixels * 4) // 4), 0, points)
+    pixel = pixel_index(hits, rows)
+    finest = dr.gather(mi.Bool, at, pixel)
+    return image, finest, dr.gather(mi.Bool, every, pixel) & ~finest
 
 
-def _near_outlines(hits: Samples, depth: mi.Float, rows: mi.UInt32, pixels: int) -> mi.Bool:
-    """(pixels,) pixels beside a jump in depth or a border of the object, and all within ``OUTLINE_REACH`` of them.
-    Only neighbours in a row or column are compared: further apart, the depths of any slanted surface differ."""
+def _jumps(hits: Samples, depth: mi.Float, raster: _Raster) -> mi.Bool:
+    """(pixels,) pixels beside a jump in depth or a border of the object. Only neighbours in a row or column are
+    compared: further apart, the depths of any slanted surface differ."""
     far = dr.select(hits.triangle == rays.MISS, mi.Float(1e30), depth)
-    image = dr.zeros(mi.Float, pixels)
-    dr.scatter(image, far, pixel_index(hits, rows), mode=dr.ReduceMode.Permute)
+    image = dr.zeros(mi.Float, raster.pixels)
+    dr.scatter(image, far, pixel_index(hits, raster.rows), mode=dr.ReduceMode.Permute)
     dr.eval(image)
-    i = dr.arange(mi.UInt32, pixels)
-    line = i // rows
-    column, row = i - line * rows, line % rows
-    axes = (column, mi.UInt32(1)), (row, rows)
     nearest = farthest = image
-    for place, stride in axes:
-        for neighbour in _neighbours(i, place, stride, rows, 1):
+    for axis in (0, 1):
+        for neighbour in raster.neighbours(axis, 1):
             at = dr.gather(mi.Float, image, neighbour)
             nearest, farthest = dr.fmin(nearest, at), dr.fmax(farthest, at)
-    near = farthest > DISCONTINUITY * nearest
-    for place, stride in axes:  # a square: along rows first, then along columns
-        dr.eval(near)
-        before = near
-        for away in range(1, OUTLINE_REACH + 1):
-            for neighbour in _neighbours(i, place, stride, rows, away):
-                near |= dr.gather(mi.Bool, before, neighbour)
-    dr.eval(near)
-    return near
+    return farthest > DISCONTINUITY * nearest
 
 
-def _neighbours(
-    i: mi.UInt32, place: mi.UInt32, stride: mi.UInt32, rows: mi.UInt32, away: int
-) -> tuple[mi.UInt32, mi.UInt32]:
-    """The pixels ``away`` after and before pixels ``i`` along an axis; ``i`` itself beyond the border of the image."""
-    after = dr.select(place + away < rows, i + away * stride, i)
-    return after, dr.select(place >= away, i - away * stride, i)
+class _Raster:
+    """The pixels of a batch in the order of its images, and who is whose neighbour."""
+
+    def __init__(self, rows: mi.UInt32, pixels: int) -> None:
+        self.rows, self.pixels = rows, pixels
+        self._index = dr.arange(mi.UInt32, pixels)
+        line = self._index // rows
+        self._axes = (self._index - line * rows, mi.UInt32(1)), (line % rows, rows)
+
+    def neighbours(self, axis: int, away: int) -> tuple[mi.UInt32, mi.UInt32]:
+        """The pixels ``away`` after and before each along an axis; itself beyond the border of the image."""
+        i, (place, stride) = self._index, self._axes[axis]
+        after = dr.select(place + away < self.rows, i + away * stride, i)
+        return after, dr.select(place >= away, i - away * stride, i)
+
+    def grown(self, marked: mi.Bool, reach: int) -> mi.Bool:
+        """(pixels,) all within squares of ``reach`` pixels around marked ones."""
+        for axis in (0, 1):  # along rows first, then along columns
+            dr.eval(marked)
+            before = marked
+            for away in range(1, reach + 1):
+                for neighbour in self.neighbours(axis, away):
+                    # no |=: it would change the array in place, which is the caller's
+                    marked = marked | dr.gather(mi.Bool, before, neighbour)
+        dr.eval(marked)
+        return marked
 
 
 def _with_shaded(

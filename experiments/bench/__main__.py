@@ -155,6 +155,7 @@ def projective(rows: dict) -> float:
 
     from appearance_opt.initial.sphere import sphere
 
+    mi.set_log_level(mi.LogLevel.Error)  # it warns in every call that nothing is seen indirectly
     low = sphere(3000, (0.0, 0.0, 0.0), 0.93, 64)
     mesh = mi.Mesh("m", len(low.positions), len(low.faces))
     p = mi.traverse(mesh)
