@@ -124,7 +124,7 @@ def coverage_derivative(density: float, samples: int) -> tuple[float, float]:
     for scale in (1.02, 0.98):
         model.parameters[POSITIONS].value = mi.Float(start * scale)
         model.update_scene()
-        image = deferred.render_image(model.scene, surface, maps, records, grid, 64)
+        image = deferred.render_image(model.scene, model.surface(model.positions()), maps, records, grid, 64)
         areas.append(float(np.array(image).reshape(-1, 4)[:, 3].sum()))
     return edge, (areas[0] - areas[1]) / 0.04
 

@@ -11,9 +11,10 @@ import pytest
 from scipy.ndimage import maximum_filter
 
 from appearance_opt.asset.types import Asset, Material, Mesh, Texture
+from appearance_opt.initial.sphere import sphere
 from appearance_opt.latent.texels import TexelCodec
 from appearance_opt.reference.mesh import MeshReference
-from appearance_opt.render import brdf
+from appearance_opt.render import brdf, rays, upload
 from appearance_opt.render.brdf import MaterialSample
 from appearance_opt.render.deferred import Grid
 from appearance_opt.render.math import angle_of
@@ -242,3 +243,24 @@ def test_a_pair_is_the_image_at_outlines_and_points_elsewhere(ball: Asset) -> No
     # a slanted surface is no outline, although depths five pixels apart differ by more than 2 % there
     assert same[~within(8)].all()
     assert within(8).mean() < 0.4
+
+
+def test_a_moved_scene_shows_what_a_new_one_does() -> None:
+    """The BVH of a moving mesh is another one than that of a mesh that stands still."""
+    mesh, grid = sphere(400, (0.0, 0.0, 0.0), 0.9, 16), Grid(2, 64)
+    moved = (mesh.positions * np.float32([0.5, 1.0, 0.8]) + np.float32([0.2, 0.0, 0.0])).astype(np.float32)
+    moving = upload.MovingScene(mesh.positions, mesh.faces)
+    records = ViewSampler((0.0, 0.0, 0.0), 1.0, seed=4).draw(0, 2).records()
+
+    def seen(scene: mi.Scene) -> tuple[np.ndarray, np.ndarray]:
+        at = mi.Float(grid.column) + 0.5, mi.Float(grid.row) + 0.5
+        hits, depth = rays.trace_depth(scene, records, grid.view, *at, grid.size)
+        return np.array(hits.triangle), np.array(depth)
+
+    for positions in (mesh.positions, moved):
+        moving.move(mi.Float(positions.ravel()))
+        (triangle, depth), (expected, there) = seen(moving.scene), seen(upload.scene_of(positions, mesh.faces))
+        assert (expected != rays.MISS).sum() > 500
+        # on an edge between two triangles either may be met
+        assert (triangle == expected).mean() > 0.999
+        np.testing.assert_allclose(depth, there, rtol=1e-5)

@@ -7,12 +7,12 @@ surface's buffers and the texels; visibility is not (see ``silhouette`` for its 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import mitsuba as mi
 
-from appearance_opt.render import brdf, material, rays
+from appearance_opt.render import brdf, material, raster, rays
 from appearance_opt.render.freezing import traced
 from appearance_opt.render.material import MaterialMaps
 from appearance_opt.render.math import at_least
@@ -110,7 +110,7 @@ def render_image(
     filtered = samples**-0.5 if width is None else width
     image = dr.zeros(mi.Float, grid.pixels * 4)
     for dx, dy in rays.sub_pixel_offsets(samples):
-        hits, _, covered = _seen(scene, records, grid, dx, dy, run)
+        hits, _, covered = _seen(scene, drawing, grid, dx, dy, run)
         # one sample per pixel in each pass: no two threads meet
         mode = dr.ReduceMode.NoConflicts
         image = _with_shaded(image, drawing, hits, covered, 1 / samples, filtered, mode, run)
@@ -143,7 +143,7 @@ def render_pair(
     ``samples`` rays at them, of fewer around them. Costs a fraction of ``samples`` full images. ``run``: as in
     ``render_image``."""
     drawing = Drawing(surface, maps, records, grid.size, grid.rows)
-    hits, depth, covered = _seen(scene, records, grid, 0.5, 0.5, run)
+    hits, depth, covered = _seen(scene, drawing, grid, 0.5, 0.5, run)
     points, mode = dr.zeros(mi.Float, grid.pixels * 4), dr.ReduceMode.NoConflicts
     points = _with_shaded(points, drawing, hits, covered, 1.0, width, mode, run)
     band = max(round(BAND_REACH * grid.resolution) - OUTLINE_REACH, 0)
@@ -160,13 +160,31 @@ def render_pair(
 
 
 def _seen(
-    scene: mi.Scene, records: mi.Float, grid: Grid, dx: float, dy: float, run: Run
+    scene: mi.Scene, drawing: Drawing, grid: Grid, dx: float, dy: float, run: Run
 ) -> tuple[Samples, mi.Float, mi.UInt32]:
-    """(what the ray at the offset (dx, dy) in every pixel hits, its depth, indices of those that hit)."""
-    offset = dr.opaque(mi.Float, dx), dr.opaque(mi.Float, dy)
-    hits, depth, hit = run(_traced_at, scene, records, grid.view, grid.column, grid.row, *offset, grid.size)
-    dr.eval(hits, depth, hit)
+    """(what every pixel shows at the offset (dx, dy), its depth, indices of those that show anything)."""
+    hits, depth, hit = visible(scene, drawing.surface, drawing.records, grid, dx, dy, run)
     return hits, depth, dr.compress(hit)
+
+
+def visible(
+    scene: mi.Scene, surface: Surface, records: mi.Float, grid: Grid, dx: float, dy: float, run: Run
+) -> tuple[Samples, mi.Float, mi.Bool]:
+    """(what every pixel shows at the offset (dx, dy), its depth, does it show anything?). By rays through ``scene`` or
+    by drawing ``surface``, the same mesh, whichever is faster."""
+    at = grid.view, grid.column, grid.row, dr.opaque(mi.Float, dx), dr.opaque(mi.Float, dy), grid.size
+    if raster.pays(surface, grid):
+        mesh = surface.vertices, surface.faces, records
+        found = run(_drawn_at, *mesh, *at, grid.rows, grid.views, grid.pixels)
+    else:
+        found = run(_traced_at, scene, records, *at)
+    dr.eval(found)
+    return found
+
+
+def _drawn_at(*arguments: Any) -> tuple[Samples, mi.Float, mi.Bool]:
+    hits, depth = raster.visible(*arguments)
+    return hits, depth, hits.triangle != rays.MISS
 
 
 def _traced_at(

@@ -23,7 +23,7 @@ import drjit as dr
 import mitsuba as mi
 
 from appearance_opt.render import coverage, meetings, pairs, rays, silhouette
-from appearance_opt.render.deferred import Grid, pixel_index, shade
+from appearance_opt.render.deferred import Grid, pixel_index, shade, visible
 from appearance_opt.render.freezing import traced
 from appearance_opt.render.material import MaterialMaps
 from appearance_opt.render.meetings import Meetings
@@ -138,7 +138,7 @@ def render(
                     per_axis = isqrt(quality.samples)
                     met = pairs.meeting_points(scene, edge_list, surface.vertices, records, grid, per_axis, run)
             crossing = [b.pixel for b in (edges, met) if b is not None]
-            averaged, deferred, crossed = _camera_samples(scene, records, grid, crossing, quality, defer, run)
+            averaged, deferred, crossed = _camera_samples(scene, surface, records, grid, crossing, quality, defer, run)
         width = dr.opaque(mi.Float, filtered)
         # pairs blend what few rays miss; elsewhere the silhouette's line knows it
         corrected = quality.edge_samples if quality.visibility == "edges" else None
@@ -230,6 +230,7 @@ def backward(terms: list[mi.Float]) -> None:
 
 def _camera_samples(
     scene: mi.Scene,
+    surface: Surface,
     records: mi.Float,
     grid: Grid,
     crossing: list[mi.UInt32],
@@ -250,7 +251,11 @@ def _camera_samples(
     def rays_in(places: mi.UInt32, count: int) -> tuple[Samples, mi.Bool]:
         return rays.trace_every(scene, records, grid.view, grid.column, grid.row, places, count, grid.size, run)
 
-    fine, covered = rays_in(dr.compress(~on_edge), quality.samples)
+    if quality.samples == 1:
+        fine, _, covered = visible(scene, surface, records, grid, 0.5, 0.5, run)
+        covered &= ~on_edge
+    else:
+        fine, covered = rays_in(dr.compress(~on_edge), quality.samples)
     deferred, others = None, covered
     if defer and quality.samples <= DEFERRED:
         deferred, others = _whole_pixels(fine, covered, grid, quality)
