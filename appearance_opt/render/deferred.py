@@ -1,7 +1,8 @@
 """The deferred renderer: visibility -> samples -> attributes -> material -> light -> pixels.
 
-Every stage is a pure function of device arrays. ``shade`` and ``resolve`` are differentiable in the
-surface's buffers and the texels; visibility is not (see ``silhouette`` for its derivative).
+Every stage is a pure function of device arrays. ``shade`` is differentiable in the surface's buffers and the texels;
+visibility is not (see ``silhouette`` for its derivative). The scene, in which rays are traced, and the surface, which
+is drawn and shaded, are the same mesh at the same place.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import drjit as dr
 import mitsuba as mi
 
-from appearance_opt.render import brdf, material, raster, rays
+from appearance_opt.render import brdf, material, outlines, raster, rays
 from appearance_opt.render.freezing import traced
 from appearance_opt.render.material import MaterialMaps
 from appearance_opt.render.math import at_least
@@ -117,12 +118,6 @@ def render_image(
     return image
 
 
-DISCONTINUITY = 1.02
-"""Ratio of depths between neighbouring pixels from which an outline may pass between them."""
-
-OUTLINE_REACH = 1
-"""Pixels beyond the two at a jump that are sampled as finely."""
-
 BAND_REACH, BAND_SHARE = 0.02, 0.5
 """Pixels up to this part of the image's width from a jump, where a fitted shape's outlines may lie meanwhile, are
 sampled, too: by this part of the rays."""
@@ -146,7 +141,7 @@ def render_pair(
     hits, depth, covered = _seen(scene, drawing, grid, 0.5, 0.5, run)
     points, mode = dr.zeros(mi.Float, grid.pixels * 4), dr.ReduceMode.NoConflicts
     points = _with_shaded(points, drawing, hits, covered, 1.0, width, mode, run)
-    band = max(round(BAND_REACH * grid.resolution) - OUTLINE_REACH, 0)
+    band = max(round(BAND_REACH * grid.resolution) - outlines.REACH, 0)
     average, at, around = run(_without_outlines, points, hits, depth, grid.rows, grid.pixels, band)
     dr.eval(average, at, around)
     for outlined, count in ((at, samples), (around, max(round(BAND_SHARE * samples), 1))):
@@ -206,56 +201,12 @@ def _without_outlines(
 ) -> tuple[mi.Float, mi.Bool, mi.Bool]:
     """(the image ``points`` with zeros in the pixels at outlines and around them; for each of ``hits``: is it at one?
     Is it one of the ``band`` pixels around?)"""
-    raster = _Raster(rows, pixels)
-    at = raster.grown(_jumps(hits, depth, raster), OUTLINE_REACH)
-    every = raster.grown(at, band)
-    image = dr.select(dr.gather(mi.Bool, every, dr.arange(mi.UInt32, pixels * 4) // 4), 0, points)
     pixel = pixel_index(hits, rows)
+    far = dr.select(hits.triangle == rays.MISS, mi.Float(outlines.NOTHING), depth)
+    at, every = outlines.find(far, pixel, rows, pixels, band)
+    image = dr.select(dr.gather(mi.Bool, every, dr.arange(mi.UInt32, pixels * 4) // 4), 0, points)
     finest = dr.gather(mi.Bool, at, pixel)
     return image, finest, dr.gather(mi.Bool, every, pixel) & ~finest
-
-
-def _jumps(hits: Samples, depth: mi.Float, raster: _Raster) -> mi.Bool:
-    """(pixels,) pixels beside a jump in depth or a border of the object. Only neighbours in a row or column are
-    compared: further apart, the depths of any slanted surface differ."""
-    far = dr.select(hits.triangle == rays.MISS, mi.Float(1e30), depth)
-    image = dr.zeros(mi.Float, raster.pixels)
-    dr.scatter(image, far, pixel_index(hits, raster.rows), mode=dr.ReduceMode.Permute)
-    dr.eval(image)
-    nearest = farthest = image
-    for axis in (0, 1):
-        for neighbour in raster.neighbours(axis, 1):
-            at = dr.gather(mi.Float, image, neighbour)
-            nearest, farthest = dr.fmin(nearest, at), dr.fmax(farthest, at)
-    return farthest > DISCONTINUITY * nearest
-
-
-class _Raster:
-    """The pixels of a batch in the order of its images, and who is whose neighbour."""
-
-    def __init__(self, rows: mi.UInt32, pixels: int) -> None:
-        self.rows, self.pixels = rows, pixels
-        self._index = dr.arange(mi.UInt32, pixels)
-        line = self._index // rows
-        self._axes = (self._index - line * rows, mi.UInt32(1)), (line % rows, rows)
-
-    def neighbours(self, axis: int, away: int) -> tuple[mi.UInt32, mi.UInt32]:
-        """The pixels ``away`` after and before each along an axis; itself beyond the border of the image."""
-        i, (place, stride) = self._index, self._axes[axis]
-        after = dr.select(place + away < self.rows, i + away * stride, i)
-        return after, dr.select(place >= away, i - away * stride, i)
-
-    def grown(self, marked: mi.Bool, reach: int) -> mi.Bool:
-        """(pixels,) all within squares of ``reach`` pixels around marked ones."""
-        for axis in (0, 1):  # along rows first, then along columns
-            dr.eval(marked)
-            before = marked
-            for away in range(1, reach + 1):
-                for neighbour in self.neighbours(axis, away):
-                    # no |=: it would change the array in place, which is the caller's
-                    marked = marked | dr.gather(mi.Bool, before, neighbour)
-        dr.eval(marked)
-        return marked
 
 
 def _with_shaded(
