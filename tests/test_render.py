@@ -235,14 +235,12 @@ def test_a_pair_is_the_image_at_outlines_and_points_elsewhere(ball: Asset) -> No
     def within(reach: int) -> np.ndarray:
         return np.stack([maximum_filter(view, 2 * reach + 1) for view in outline])
 
-    # around an outline, where a fitted shape's may lie, fewer rays are averaged
-    around = within(4) & ~within(2) & (full[..., 3] == 1) & lit
-    assert around.sum() > 1000
-    assert not same[around].any()
-    assert 1e-6 < np.abs(average - full)[around].max() < 5e-3
+    beside = within(1) & ~outline & (full[..., 3] == 1) & lit
+    assert beside.sum() > 500
+    assert not same[beside].any()
     # a slanted surface is no outline, although depths five pixels apart differ by more than 2 % there
-    assert same[~within(8)].all()
-    assert within(8).mean() < 0.4
+    assert same[~within(5)].all()
+    assert within(5).mean() < 0.3
 
 
 def test_a_moved_scene_shows_what_a_new_one_does() -> None:

@@ -118,11 +118,6 @@ def render_image(
     return image
 
 
-BAND_REACH, BAND_SHARE = 0.02, 0.5
-"""Pixels up to this part of the image's width from a jump, where a fitted shape's outlines may lie meanwhile, are
-sampled, too: by this part of the rays."""
-
-
 def render_pair(
     scene: mi.Scene,
     surface: Surface,
@@ -135,22 +130,18 @@ def render_pair(
 ) -> tuple[mi.Float, mi.Float]:
     """(average, points): two images of the same views. ``points`` is what the ray through the middle of each pixel
     sees, textures filtered over ``width`` pixels; ``average`` is the same away from outlines, and the mean of
-    ``samples`` rays at them, of fewer around them. Costs a fraction of ``samples`` full images. ``run``: as in
-    ``render_image``."""
+    ``samples`` rays at them. Costs a fraction of ``samples`` full images. ``run``: as in ``render_image``."""
     drawing = Drawing(surface, maps, records, grid.size, grid.rows)
     hits, depth, covered = _seen(scene, drawing, grid, 0.5, 0.5, run)
     points, mode = dr.zeros(mi.Float, grid.pixels * 4), dr.ReduceMode.NoConflicts
     points = _with_shaded(points, drawing, hits, covered, 1.0, width, mode, run)
-    band = max(round(BAND_REACH * grid.resolution) - outlines.REACH, 0)
-    average, at, around = run(_without_outlines, points, hits, depth, grid.rows, grid.pixels, band)
-    dr.eval(average, at, around)
-    for outlined, count in ((at, samples), (around, max(round(BAND_SHARE * samples), 1))):
-        index = dr.compress(outlined)
-        if dr.width(index) == 0:
-            continue
-        fine = rays.trace_pixels(scene, records, grid.view, grid.column, grid.row, index, count, grid.size, run)
+    average, outlined = run(_without_outlines, points, hits, depth, grid.rows, grid.pixels)
+    dr.eval(average, outlined)
+    index = dr.compress(outlined)
+    if dr.width(index):
+        fine = rays.trace_pixels(scene, records, grid.view, grid.column, grid.row, index, samples, grid.size, run)
         every, mode = dr.arange(mi.UInt32, dr.width(fine.triangle)), dr.ReduceMode.Local
-        average = _with_shaded(average, drawing, fine, every, 1 / count, count**-0.5, mode, run)
+        average = _with_shaded(average, drawing, fine, every, 1 / samples, samples**-0.5, mode, run)
     return average, points
 
 
@@ -197,16 +188,14 @@ def _traced_at(
 
 
 def _without_outlines(
-    points: mi.Float, hits: Samples, depth: mi.Float, rows: mi.UInt32, pixels: int, band: int
-) -> tuple[mi.Float, mi.Bool, mi.Bool]:
-    """(the image ``points`` with zeros in the pixels at outlines and around them; for each of ``hits``: is it at one?
-    Is it one of the ``band`` pixels around?)"""
+    points: mi.Float, hits: Samples, depth: mi.Float, rows: mi.UInt32, pixels: int
+) -> tuple[mi.Float, mi.Bool]:
+    """(the image ``points`` with zeros in the pixels at outlines, whether the pixel of each of ``hits`` is one)."""
     pixel = pixel_index(hits, rows)
     far = dr.select(hits.triangle == rays.MISS, mi.Float(outlines.NOTHING), depth)
-    at, every = outlines.find(far, pixel, rows, pixels, band)
-    image = dr.select(dr.gather(mi.Bool, every, dr.arange(mi.UInt32, pixels * 4) // 4), 0, points)
-    finest = dr.gather(mi.Bool, at, pixel)
-    return image, finest, dr.gather(mi.Bool, every, pixel) & ~finest
+    outlined = outlines.find(far, pixel, rows, pixels)
+    image = dr.select(dr.gather(mi.Bool, outlined, dr.arange(mi.UInt32, pixels * 4) // 4), 0, points)
+    return image, dr.gather(mi.Bool, outlined, pixel)
 
 
 def _with_shaded(

@@ -1,4 +1,4 @@
-"""Pixels at and around the outlines of what an image shows, by jumps of its depth."""
+"""Pixels at the outlines of what an image shows, by jumps of its depth."""
 
 from __future__ import annotations
 
@@ -9,21 +9,20 @@ DISCONTINUITY = 1.02
 """Ratio of depths between neighbouring pixels from which an outline may pass between them."""
 
 REACH = 1
-"""Pixels beyond the two at a jump that count as being at an outline."""
+"""Pixels beyond the two at a jump that count as being at an outline: that of a fitted shape lies a little away."""
 
 NOTHING = 1e30
 """Depth of pixels that show nothing."""
 
 
-def find(depth: mi.Float, pixel: mi.UInt32, rows: mi.UInt32, pixels: int, band: int) -> tuple[mi.Bool, mi.Bool]:
-    """((pixels,) at an outline, the same and up to ``band`` pixels around). ``depth`` of every pixel, of which
-    ``pixel`` is the index in the batch: (view, row, column) of images of ``rows`` rows and columns."""
+def find(depth: mi.Float, pixel: mi.UInt32, rows: mi.UInt32, pixels: int) -> mi.Bool:
+    """(pixels,) which pixels are at an outline. ``depth`` of every pixel, of which ``pixel`` is the index in the batch:
+    (view, row, column) of images of ``rows`` rows and columns."""
     image = dr.empty(mi.Float, pixels)
     dr.scatter(image, depth, pixel, mode=dr.ReduceMode.Permute)
     dr.eval(image)
     batch = _Neighbourhood(rows, pixels)
-    at = batch.grown(_jumps(image, batch), REACH)
-    return at, batch.grown(at, band)
+    return batch.grown(_jumps(image, batch), REACH)
 
 
 def _jumps(depth: mi.Float, batch: _Neighbourhood) -> mi.Bool:
