@@ -228,8 +228,8 @@ def test_a_pair_is_the_image_at_outlines_and_points_elsewhere(ball: Asset) -> No
     outline = (full[..., 3] > 0) & (full[..., 3] < 1)
     assert outline.sum() > 100
     np.testing.assert_allclose(average[outline], full[outline], rtol=1e-4, atol=1e-5)
-    assert not (average == points).all(axis=-1)[outline].any()
-    assert (average[..., 3] == points[..., 3])[~outline].all()
+    inside = average[..., 3] == points[..., 3]
+    assert inside[~outline].all()
     same, lit = (average == points).all(axis=-1), full[..., :3].min(axis=-1) > 0
 
     def within(reach: int) -> np.ndarray:
@@ -239,6 +239,7 @@ def test_a_pair_is_the_image_at_outlines_and_points_elsewhere(ball: Asset) -> No
     assert beside.sum() > 500
     assert not same[beside].any()
     # a slanted surface is no outline, although depths five pixels apart differ by more than 2 % there
+    assert same[~outline].mean() > 0.95 and not same[outline].any()
     assert same[~within(5)].all()
     assert within(5).mean() < 0.3
 

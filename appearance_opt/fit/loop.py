@@ -176,22 +176,18 @@ class _Run:
                 state.laplacian = options.laplacian * done.loss / 0.01
         state.iteration += 1
         if self.clock.progress(state.iteration) >= self.next_look and not self.clock.done(state.iteration):
-            self._next_look(self._timed_look())
+            self._look_and_pause()
         self._report()
         if self.checkpointer is not None and self.checkpointer.due():
             self.save()
 
-    def _timed_look(self) -> float:
-        """Seconds that a look takes."""
+    def _look_and_pause(self) -> None:
+        """A look, and when to look again."""
         began = self.clock.time()
         self.look()
-        return self.clock.time() - began
-
-    def _next_look(self, seconds: float) -> None:
-        """When to look again after a look that took ``seconds``."""
         self.next_look += self.options.validate_every
         if self.options.seconds:
-            pause = seconds / (LOOKING * self.options.seconds)
+            pause = (self.clock.time() - began) / (LOOKING * self.options.seconds)
             self.next_look = max(self.next_look, self.clock.progress(self.state.iteration) + pause)
 
     def look(self) -> None:

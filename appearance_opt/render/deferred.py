@@ -8,7 +8,7 @@ is drawn and shaded, are the same mesh at the same place.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
@@ -139,9 +139,10 @@ def render_pair(
     dr.eval(average, outlined)
     index = dr.compress(outlined)
     if dr.width(index):
-        fine = rays.trace_pixels(scene, records, grid.view, grid.column, grid.row, index, samples, grid.size, run)
-        every, mode = dr.arange(mi.UInt32, dr.width(fine.triangle)), dr.ReduceMode.Local
-        average = _with_shaded(average, drawing, fine, every, 1 / samples, samples**-0.5, mode, run)
+        at = grid.view, grid.column, grid.row, index
+        fine, hit = rays.trace_pixels(scene, records, *at, samples, grid.size, run)
+        mode = dr.ReduceMode.Local
+        average = _with_shaded(average, drawing, fine, dr.compress(hit), 1 / samples, samples**-0.5, mode, run)
     return average, points
 
 
@@ -161,16 +162,12 @@ def visible(
     at = grid.view, grid.column, grid.row, dr.opaque(mi.Float, dx), dr.opaque(mi.Float, dy), grid.size
     if raster.pays(surface, grid):
         mesh = surface.vertices, surface.faces, records
-        found = run(_drawn_at, *mesh, *at, grid.rows, grid.views, grid.pixels)
+        hits, depth = run(raster.visible, *mesh, *at, grid.rows, grid.views, grid.pixels)
     else:
-        found = run(_traced_at, scene, records, *at)
-    dr.eval(found)
-    return found
-
-
-def _drawn_at(*arguments: Any) -> tuple[Samples, mi.Float, mi.Bool]:
-    hits, depth = raster.visible(*arguments)
-    return hits, depth, hits.triangle != rays.MISS
+        hits, depth = run(_traced_at, scene, records, *at)
+    hit = hits.triangle != rays.MISS
+    dr.eval(hits, depth, hit)
+    return hits, depth, hit
 
 
 def _traced_at(
@@ -182,9 +179,8 @@ def _traced_at(
     dx: mi.Float,
     dy: mi.Float,
     size: mi.Float,
-) -> tuple[Samples, mi.Float, mi.Bool]:
-    hits, depth = rays.trace_depth(scene, records, view, mi.Float(column) + dx, mi.Float(row) + dy, size)
-    return hits, depth, hits.triangle != rays.MISS
+) -> tuple[Samples, mi.Float]:
+    return rays.trace_depth(scene, records, view, mi.Float(column) + dx, mi.Float(row) + dy, size)
 
 
 def _without_outlines(

@@ -249,7 +249,7 @@ def _camera_samples(
     dr.eval(on_edge, pixel)
 
     def rays_in(places: mi.UInt32, count: int) -> tuple[Samples, mi.Bool]:
-        return rays.trace_every(scene, records, grid.view, grid.column, grid.row, places, count, grid.size, run)
+        return rays.trace_pixels(scene, records, grid.view, grid.column, grid.row, places, count, grid.size, run)
 
     if quality.samples == 1:
         fine, _, covered = visible(scene, surface, records, grid, 0.5, 0.5, run)
@@ -273,7 +273,7 @@ def _camera_samples(
 
 def _whole_pixels(fine: Samples, covered: mi.Bool, grid: Grid, quality: Quality) -> tuple[Whole | None, mi.Bool | None]:
     """(the pixels whose rays are all ``covered``, which other rays are: None of one per pixel). ``fine``: as from
-    ``rays.trace_every``."""
+    ``rays.trace_pixels``."""
     count, others = quality.samples, None
     if count == 1:
         first = dr.compress(covered)

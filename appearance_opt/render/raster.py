@@ -136,7 +136,8 @@ def _drawn(
 
     first = mi.Float(share)
     drawing = somewhere & (volume > 0) & (first <= high)
-    dr.while_loop((*span(first)[:1], first, span(first)[1], drawing), lambda x, y, end, drawing: drawing, visit)
+    start, stop = span(first)
+    dr.while_loop((start, first, stop, drawing), lambda x, y, end, drawing: drawing, visit)
     return image
 
 

@@ -113,24 +113,9 @@ def trace_pixels(
     count: int,
     resolution: mi.Float,
     run: Run = traced,
-) -> Samples:
-    """The hits among ``count`` rays in each of the pixels at the positions ``index`` of (view, column, row)."""
-    fine, covered = trace_every(scene, records, view, column, row, index, count, resolution, run)
-    return keep(fine, dr.compress(covered))
-
-
-def trace_every(
-    scene: mi.Scene,
-    records: mi.Float,
-    view: mi.UInt32,
-    column: mi.UInt32,
-    row: mi.UInt32,
-    index: mi.UInt32,
-    count: int,
-    resolution: mi.Float,
-    run: Run = traced,
 ) -> tuple[Samples, mi.Bool]:
-    """All of these rays, those of a pixel one after the other, and whether each hits."""
+    """``count`` rays in each of the pixels at the positions ``index`` of (view, column, row), those of a pixel one
+    after the other, and whether each hits."""
     if dr.width(index) == 0:
         return Samples(mi.UInt32(), mi.Float(), mi.Float(), mi.UInt32()), mi.Bool()
     ray = dr.arange(mi.UInt32, dr.width(index) * count)

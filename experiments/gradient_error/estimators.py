@@ -45,7 +45,8 @@ class Ours:
         rgba = np.ones((len(target), 4), np.float32)
         rgba[:, :3] = target
         reference = Targets(mi.Float(rgba.ravel()))
-        self.inputs = StepInputs(problem.views, reference, np.array([BACKGROUND], np.float32), 0.0, 0.0, 0, False)
+        background = np.array([BACKGROUND], np.float32)
+        self.inputs = StepInputs(problem.views, reference, background, 0.0, 0.0, 0, want_loss=False)
         self._gradients: dict[Quality, Gradients] = {}
 
     def __call__(self, quality: Quality, seed: int) -> NDArray[np.float32]:
