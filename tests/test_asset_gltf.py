@@ -6,6 +6,7 @@ import json
 import shutil
 import struct
 import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -119,7 +120,7 @@ def test_strips_become_triangles_of_one_winding(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"extensionsRequired": ["KHR_draco_mesh_compression"]}, "Draco"),
+        ({"extensionsRequired": ["EXT_meshopt_compression"]}, "meshopt"),
         ({"asset": {"version": "1.0"}}, "version"),
         ({"meshes": []}, "broken"),
         ({"bufferViews": [{"buffer": 0, "byteLength": 3600}]}, "cut short"),
@@ -137,6 +138,75 @@ def test_unusable_files_say_why(tmp_path: Path, change: dict, words: str) -> Non
     write_glb(folder / "x.glb", document, binary)
     with pytest.raises(InputError, match=words):
         load(folder / "x.glb")
+
+
+def draco_document(points: np.ndarray, uvs: np.ndarray, faces: np.ndarray) -> tuple[dict, bytes]:
+    """A file whose geometry is compressed and has no other data; texture coordinates are normalized bytes."""
+    dracopy = pytest.importorskip("DracoPy")
+    data = dracopy.encode(
+        points, faces, quantization_bits=24, preserve_order=True, generic_attributes={1: (uvs * 255).astype(np.uint8)}
+    )
+    count = {"count": len(points)}
+    extension = {"bufferView": 0, "attributes": {"POSITION": 2, "TEXCOORD_0": 1}}  # the encoder numbers positions last
+    document, _ = triangle_document(
+        meshes=[
+            {
+                "primitives": [
+                    {
+                        "attributes": {"POSITION": 0, "TEXCOORD_0": 1},
+                        "indices": 2,
+                        "extensions": {"KHR_draco_mesh_compression": extension},
+                    }
+                ]
+            }
+        ],
+        accessors=[
+            {"componentType": 5126, "type": "VEC3", **count},
+            {"componentType": 5121, "type": "VEC2", "normalized": True, **count},
+            {"componentType": 5125, "type": "SCALAR", "count": faces.size},
+        ],
+        bufferViews=[{"buffer": 0, "byteLength": len(data)}],
+        buffers=[{"byteLength": len(data)}],
+        extensionsUsed=["KHR_draco_mesh_compression"],
+        extensionsRequired=["KHR_draco_mesh_compression"],
+    )
+    return document, data
+
+
+QUAD = (
+    np.array([[0, 0, 0], [1, 0, 0], [1, 2, 0], [0, 2, 3]], np.float32),
+    np.array([[0, 0], [1, 0], [1, 0.2], [0, 0.2]], np.float32),
+    np.array([[0, 1, 2], [0, 2, 3]], np.uint32),
+)
+
+
+def test_draco_compressed_geometry(tmp_path: Path) -> None:
+    points, uvs, faces = QUAD
+    write_glb(tmp_path / "x.glb", *draco_document(*QUAD))
+    mesh = load(tmp_path / "x.glb").meshes[0]
+    np.testing.assert_allclose(mesh.positions[mesh.faces], points[faces], atol=1e-5)
+    np.testing.assert_allclose(mesh.uvs[mesh.faces], uvs[faces], atol=1e-6)
+
+
+def test_damaged_draco_data_is_refused(tmp_path: Path) -> None:
+    document, data = draco_document(*QUAD)
+    write_glb(tmp_path / "x.glb", document, b"\0" * len(data))
+    with pytest.raises(InputError, match="Draco data is damaged"):
+        load(tmp_path / "x.glb")
+
+
+def test_without_the_package_draco_names_it_or_takes_the_other_data(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_glb(tmp_path / "alone.glb", *draco_document(*QUAD))
+    document, binary = triangle_document(extensionsUsed=["KHR_draco_mesh_compression"])
+    extension = {"bufferView": 0, "attributes": {"POSITION": 0}}
+    document["meshes"][0]["primitives"][0]["extensions"] = {"KHR_draco_mesh_compression": extension}
+    write_glb(tmp_path / "both.glb", document, binary)
+    monkeypatch.setitem(sys.modules, "DracoPy", None)
+    with pytest.raises(InputError, match=r"pip install 'appearance-opt\[draco\]'"):
+        load(tmp_path / "alone.glb")
+    assert len(load(tmp_path / "both.glb").meshes[0].faces) == 1
 
 
 def test_non_finite_positions_are_refused(tmp_path: Path) -> None:

@@ -11,7 +11,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from appearance_opt.asset import load, save
-from appearance_opt.asset.subdivide import Polygons, catmull_clark
+from appearance_opt.asset.polygons import Polygons
+from appearance_opt.asset.subdivide import catmull_clark
 from appearance_opt.asset.types import Asset
 from appearance_opt.asset.validate import validate
 from appearance_opt.errors import InputError
@@ -124,6 +125,25 @@ def test_geometry_formats(tmp_path: Path, suffix: str) -> None:
     asset = load(tmp_path / f"x.{suffix}")
     report = validate(asset)
     assert (report.triangles, report.boundary_edges, report.connected_parts) == (12, 0, 1)
+
+
+def test_strips_of_a_ply_file_are_refused_by_name(tmp_path: Path) -> None:
+    (tmp_path / "x.ply").write_bytes(
+        b"ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
+        b"element tristrips 1\nproperty list int int vertex_indices\nend_header\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n"
+    )
+    with pytest.raises(InputError, match="triangle strips"):
+        load(tmp_path / "x.ply")
+
+
+def test_the_picture_of_a_ply_file_is_not_looked_for(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """trimesh logs a traceback where it does not find it."""
+    header, end, body = trimesh.creation.box().export(file_type="ply").partition(b"element vertex")
+    (tmp_path / "x.ply").write_bytes(header + b"comment TextureFile absent.png\n" + end + body)
+    asset = load(tmp_path / "x.ply")
+    assert len(asset.meshes[0].faces) == 12
+    assert "its texture is ignored" in asset.notes
+    assert not caplog.records
 
 
 def test_catmull_clark_of_a_cube_tends_to_its_known_limit() -> None:

@@ -58,6 +58,22 @@ def test_ignored_textures_leave_the_factors_and_one_note_each(tmp_path: Path, pa
         assert sum(picture.name in note for note in asset.notes) == 1
 
 
+def test_a_missing_material_file(tmp_path: Path) -> None:
+    path = tmp_path / "x.obj"
+    path.write_text("mtllib absent.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl red\nf 1 2 3\n")
+    with pytest.raises(InputError, match=r"absent\.mtl.*--missing-textures ignore"):
+        load(path)
+    asset = load(path, missing_textures="ignore")
+    assert len(asset.meshes[0].faces) == 1
+    assert sum("absent.mtl" in note for note in asset.notes) == 1
+
+
+def test_a_material_without_a_name_is_the_default_one(tmp_path: Path) -> None:
+    path = tmp_path / "x.obj"
+    path.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl \nf 1 2 3\n")
+    assert len(load(path).meshes[0].faces) == 1
+
+
 def test_textures_that_are_there_are_kept(tmp_path: Path, painted: Asset) -> None:
     save(painted, tmp_path / "ball.obj")
     next(tmp_path.glob("*_roughness.png")).unlink()

@@ -22,6 +22,9 @@ def load_geometry(path: Path) -> Asset:
     path = Path(path)
     data = read_bytes(path)
     kind = path.suffix.lower().lstrip(".")
+    notes = ["no material in this format: a default one is used"]
+    if kind == "ply":
+        data = _plain_ply(data, path, notes)
     try:
         loaded = trimesh.load(io.BytesIO(data), file_type=kind, process=False, force="mesh")
     except Exception as error:  # trimesh's readers raise anything on damaged files
@@ -37,4 +40,19 @@ def load_geometry(path: Path) -> Asset:
         first, place = weld(positions)
         positions, faces, colors = positions[first], place[faces].astype(np.int32), None
     mesh = Mesh(positions, faces, colors=colors, material=Material(name=path.stem, roughness=0.8), name=path.stem)
-    return Asset((mesh,), path.stem, ("no material in this format: a default one is used",))
+    return Asset((mesh,), path.stem, tuple(notes))
+
+
+def _plain_ply(data: bytes, path: Path, notes: list[str]) -> bytes:
+    """A PLY file without the name of a picture in its header, which trimesh would look for. Raises InputError if it
+    has triangle strips, which trimesh passes over."""
+    header, end, body = data.partition(b"end_header")
+    if not end:
+        return data
+    lines = header.split(b"\n")
+    if any(line.split()[:2] == [b"element", b"tristrips"] for line in lines):
+        raise InputError(f"{path}: triangle strips are not supported; save it with faces")
+    kept = [line for line in lines if line.split()[:2] != [b"comment", b"TextureFile"]]
+    if len(kept) < len(lines):
+        notes.append("its texture is ignored")
+    return b"\n".join(kept) + end + body

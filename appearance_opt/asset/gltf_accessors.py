@@ -86,9 +86,15 @@ class Document:
             out[where[:, 0]] = self._elements(
                 s["values"]["bufferView"], s["values"].get("byteOffset", 0), kind, width, s["count"]
             )
+        return self.scaled(index, out)
+
+    def scaled(self, index: int, stored: NDArray) -> NDArray:
+        """What the numbers ``stored`` of an accessor mean: floats in [-1, 1] if it is normalized, else themselves."""
+        a = self.items("accessors")[index]
+        kind = np.dtype(COMPONENTS[a["componentType"]])
         if a.get("normalized") and kind.kind != "f":
-            return np.maximum(out.astype(np.float32) / np.float32(np.iinfo(kind.type).max), -1)
-        return out
+            return np.maximum(stored.astype(np.float32) / np.float32(np.iinfo(kind.type).max), -1)
+        return stored
 
     def _elements(self, view: int, offset: int, kind: np.dtype, width: int, count: int) -> NDArray:
         data, stride = self.buffer_view(view)

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from appearance_opt.asset import images, uv_frames
+from appearance_opt.asset import images, specular_glossiness, uv_frames
 from appearance_opt.asset.gltf_accessors import Document
+from appearance_opt.asset.gltf_draco import DRACO, Compressed
 from appearance_opt.asset.missing import Missing, MissingTextures
 from appearance_opt.asset.types import Asset, Material, Mesh, Texture, Wrap
 from appearance_opt.errors import InputError
@@ -19,11 +20,11 @@ if TYPE_CHECKING:
 
 _WRAPS: dict[int, Wrap] = {10497: "repeat", 33071: "clamp", 33648: "mirror"}
 _COMPRESSED = {
-    "KHR_draco_mesh_compression": "Draco",
     "EXT_meshopt_compression": "meshopt",
     "KHR_texture_basisu": "Basis Universal",
 }
-_HARMLESS = {"KHR_mesh_quantization", "KHR_texture_transform", "EXT_texture_webp"}
+_SPECULAR = "KHR_materials_pbrSpecularGlossiness"
+_HARMLESS = {DRACO, _SPECULAR, "KHR_mesh_quantization", "KHR_texture_transform", "EXT_texture_webp"}
 
 
 def load_gltf(path: Path, missing_textures: MissingTextures = "error") -> Asset:
@@ -95,23 +96,33 @@ class _Reader:
         if primitive.get("targets"):
             self._note("morph targets ignored")
         attributes = primitive["attributes"]
-        read = self.document.accessor
-        positions = read(attributes["POSITION"])[:, :3].astype(np.float64)
-        indices = read(primitive["indices"])[:, 0] if "indices" in primitive else np.arange(len(positions))
-        faces = _triangles(indices.astype(np.int64), mode)
+        compressed = Compressed.of(self.document, primitive)
+
+        def read(name: str) -> NDArray:
+            if compressed is not None and name in compressed:
+                return compressed.attribute(name)
+            return self.document.accessor(attributes[name])
+
+        positions = read("POSITION")[:, :3].astype(np.float64)
+        if compressed is not None:
+            faces = compressed.faces
+        else:
+            accessor = primitive.get("indices")
+            indices = np.arange(len(positions)) if accessor is None else self.document.accessor(accessor)[:, 0]
+            faces = _triangles(indices.astype(np.int64), mode)
         linear = world[:3, :3]
         if np.linalg.det(linear) < 0:
             faces = faces[:, ::-1]
         normals = tangents = colors = None
         if "NORMAL" in attributes:
-            normals = _normalized(read(attributes["NORMAL"]).astype(np.float64) @ _cofactor(linear).T)
+            normals = _normalized(read("NORMAL").astype(np.float64) @ _cofactor(linear).T)
         if "TANGENT" in attributes and normals is not None:
-            t = read(attributes["TANGENT"]).astype(np.float64)
+            t = read("TANGENT").astype(np.float64)
             tangents = np.concatenate([_normalized(t[:, :3] @ linear.T), np.where(t[:, 3:4] < 0, -1, 1)], axis=1)
         if "COLOR_0" in attributes:
-            colors = read(attributes["COLOR_0"])[:, :3].astype(np.float32)
+            colors = read("COLOR_0")[:, :3].astype(np.float32)
         material, channel = self._material(primitive.get("material"))
-        uvs = read(attributes[f"TEXCOORD_{channel}"]) if f"TEXCOORD_{channel}" in attributes else None
+        uvs = read(f"TEXCOORD_{channel}") if f"TEXCOORD_{channel}" in attributes else None
         return Mesh(
             positions=(positions @ linear.T + world[:3, 3]).astype(np.float32),
             faces=np.ascontiguousarray(faces, np.int32),
@@ -128,12 +139,11 @@ class _Reader:
         if index is None:
             return {}
         m = self.document.items("materials")[index]
-        pbr = m.get("pbrMetallicRoughness", {})
-        infos = {
-            "base_color_texture": pbr.get("baseColorTexture"),
-            "orm_texture": pbr.get("metallicRoughnessTexture"),
-            "normal_texture": m.get("normalTexture"),
-        }
+        pbr, specular = m.get("pbrMetallicRoughness", {}), m.get("extensions", {}).get(_SPECULAR)
+        color, orm = pbr.get("baseColorTexture"), pbr.get("metallicRoughnessTexture")
+        if specular is not None:  # both are made of both of its textures
+            color = orm = specular.get("diffuseTexture", specular.get("specularGlossinessTexture"))
+        infos = {"base_color_texture": color, "orm_texture": orm, "normal_texture": m.get("normalTexture")}
         return {name: info for name, info in infos.items() if info is not None}
 
     def _in_one_frame(self, meshes: list[Mesh]) -> list[Mesh]:
@@ -179,9 +189,12 @@ class _Reader:
 
     def _read_material(self, index: int) -> Material:
         m = self.document.items("materials")[index]
-        pbr = m.get("pbrMetallicRoughness", {})
         name = m.get("name", f"material{index}")
-        factor = [float(x) for x in pbr.get("baseColorFactor", (1, 1, 1, 1))]
+        specular = m.get("extensions", {}).get(_SPECULAR)
+        if specular is None:
+            material = self._metallic(m.get("pbrMetallicRoughness", {}), name)
+        else:
+            material = self._converted(specular, name)
         if "occlusionTexture" in m:
             self._note("occlusion ignored (it is not part of the appearance under a moving light)")
         if "emissiveTexture" in m or any(m.get("emissiveFactor", ())):
@@ -190,20 +203,47 @@ class _Reader:
         if mode != "opaque":
             self._note(f"material '{name}': transparency ignored, drawn opaque")
         normal = m.get("normalTexture")
+        return replace(
+            material,
+            normal_scale=float(normal.get("scale", 1.0)) if normal else 1.0,
+            normal_texture=self._texture(normal, "linear", name),
+            alpha_mode=mode,  # type: ignore[arg-type]
+            alpha_cutoff=float(m.get("alphaCutoff", 0.5)),
+            double_sided=bool(m.get("doubleSided", False)),
+        )
+
+    def _metallic(self, pbr: dict[str, Any], name: str) -> Material:
+        factor = [float(x) for x in pbr.get("baseColorFactor", (1, 1, 1, 1))]
         return Material(
             name=name,
             base_color=(factor[0], factor[1], factor[2]),
             roughness=float(pbr.get("roughnessFactor", 1.0)),
             metalness=float(pbr.get("metallicFactor", 1.0)),
-            normal_scale=float(normal.get("scale", 1.0)) if normal else 1.0,
             base_color_texture=self._texture(pbr.get("baseColorTexture"), "srgb", name),
             orm_texture=self._texture(pbr.get("metallicRoughnessTexture"), "linear", name),
-            normal_texture=self._texture(normal, "linear", name),
             opacity=factor[3],
-            alpha_mode=mode,  # type: ignore[arg-type]
-            alpha_cutoff=float(m.get("alphaCutoff", 0.5)),
-            double_sided=bool(m.get("doubleSided", False)),
         )
+
+    def _converted(self, given: dict[str, Any], name: str) -> Material:
+        """A specular-glossiness material as a metallic-roughness one."""
+        self._note("specular-glossiness materials converted to metallic-roughness")
+        infos = [given[k] for k in ("diffuseTexture", "specularGlossinessTexture") if k in given]
+        if len({str((i.get("texCoord"), i.get("extensions"))) for i in infos}) > 1:
+            self._note(f"material '{name}': its textures differ in transform: the first one's is used for all")
+        diffuse = [float(x) for x in given.get("diffuseFactor", (1, 1, 1, 1))]
+        specular = [float(x) for x in given.get("specularFactor", (1, 1, 1))]
+        read = specular_glossiness.Specular(
+            (diffuse[0], diffuse[1], diffuse[2]),
+            (specular[0], specular[1], specular[2]),
+            float(given.get("glossinessFactor", 1.0)),
+            self._texture(given.get("diffuseTexture"), "srgb", name),
+            self._texture(given.get("specularGlossinessTexture"), "srgb", name),
+        )
+        if read.diffuse_texture is None and read.specular_texture is None:
+            color, roughness, metalness = specular_glossiness.constants(read)
+            return Material(name, color, roughness, metalness, opacity=diffuse[3])
+        base, orm = specular_glossiness.textures(read)
+        return Material(name, (1, 1, 1), 1.0, 1.0, base_color_texture=base, orm_texture=orm, opacity=diffuse[3])
 
     def _texture(self, info: dict[str, Any] | None, space: str, material: str) -> Texture | None:
         if info is None:

@@ -1,4 +1,4 @@
-"""What becomes of textures that an asset names and that are not there."""
+"""What becomes of textures and material files that an asset names and that are not there."""
 
 from __future__ import annotations
 
@@ -19,20 +19,21 @@ T = TypeVar("T")
 
 @dataclass
 class Missing:
-    """``policy``: refuse an asset that lacks a texture, or go on without it. ``notes``: the reader's notes; each
-    texture that was ignored is named there once."""
+    """``policy``: refuse an asset that lacks a file, or go on without it. ``notes``: the reader's notes; each
+    file that was ignored is named there once."""
 
     policy: MissingTextures = "error"
     notes: list[str] = field(default_factory=list)
 
-    def read(self, texture: Callable[[], T]) -> T | None:
-        """What ``texture`` reads; None if its file is missing and that is to be ignored. Raises InputError."""
+    def read(self, file: Callable[[], T], instead: str = "the material's constants stand alone") -> T | None:
+        """What ``file`` reads; None if it is missing and that is to be ignored. ``instead``: what the note says
+        becomes of it. Raises InputError."""
         try:
-            return texture()
+            return file()
         except MissingFileError as error:
             if self.policy == "error":
-                raise InputError(f"{error}; add the texture, or go on without it: --missing-textures ignore") from None
-            note = f"{error}: ignored, the material's constants stand alone"
+                raise InputError(f"{error}; add the file, or go on without it: --missing-textures ignore") from None
+            note = f"{error}: ignored, {instead}"
             if note not in self.notes:
                 self.notes.append(note)
             return None

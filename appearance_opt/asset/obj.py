@@ -13,6 +13,7 @@ from appearance_opt.asset import images
 from appearance_opt.asset.missing import Missing, MissingTextures
 from appearance_opt.asset.packing import pack_orm
 from appearance_opt.asset.paths import read_bytes, replacing, resolve
+from appearance_opt.asset.polygons import Polygons, triangulate
 from appearance_opt.asset.types import Asset, Material, Mesh, Texture
 from appearance_opt.errors import InputError
 
@@ -48,8 +49,8 @@ class _Parser:
         self.positions: list[list[float]] = []
         self.uvs: list[list[float]] = []
         self.normals: list[list[float]] = []
-        self.corners: dict[str, list[tuple[int, int, int]]] = {}
-        self.current: list[tuple[int, int, int]] = self.corners.setdefault("", [])
+        self.polygons: dict[str, list[list[tuple[int, int, int]]]] = {}
+        self.current: list[list[tuple[int, int, int]]] = self.polygons.setdefault("", [])
         self.materials: dict[str, Material] = {}
         self.notes: list[str] = []
         self.missing = Missing(missing_textures, self.notes)
@@ -69,13 +70,14 @@ class _Parser:
             corners = [self._corner(w) for w in words[1:]]
             if len(corners) < 3:
                 raise ValueError
-            for k in range(1, len(corners) - 1):
-                self.current += (corners[0], corners[k], corners[k + 1])
+            self.current.append(corners)
         elif key == "usemtl":
-            self.current = self.corners.setdefault(line.split(None, 1)[1].strip(), [])
+            self.current = self.polygons.setdefault(line[line.index(key) + len(key) :].strip(), [])
         elif key == "mtllib":
             name = line.split(None, 1)[1].strip()
-            self.materials.update(load_mtl(resolve(name, self.path), self.notes, self.missing))
+            path = self.missing.read(lambda: resolve(name, self.path), "default materials stand for its own")
+            if path is not None:
+                self.materials.update(load_mtl(path, self.notes, self.missing))
 
     def _corner(self, word: str) -> tuple[int, int, int]:
         parts = word.split("/")
@@ -92,13 +94,13 @@ class _Parser:
         return (out[0], out[1], out[2])
 
     def asset(self) -> Asset:
-        meshes = [self._mesh(name, c) for name, c in self.corners.items() if c]
+        meshes = [self._mesh(name, p) for name, p in self.polygons.items() if p]
         return Asset(tuple(meshes), self.path.stem, tuple(self.notes))
 
-    def _mesh(self, name: str, corners: list[tuple[int, int, int]]) -> Mesh:
+    def _mesh(self, name: str, polygons: list[list[tuple[int, int, int]]]) -> Mesh:
         if name and name not in self.materials:
             self.notes.append(f"material '{name}' is not defined: default material used")
-        used, faces = np.unique(np.array(corners, np.int64), axis=0, return_inverse=True)
+        used, index = np.unique(np.array([c for p in polygons for c in p], np.int64), axis=0, return_inverse=True)
         for k, (what, rows) in enumerate((("position", self.positions), ("uv", self.uvs), ("normal", self.normals))):
             if used[:, k].max() >= len(rows) and used[:, k].max() >= 0:
                 raise InputError(
@@ -107,6 +109,9 @@ class _Parser:
         vertices = [self.positions[i] for i in used[:, 0]]
         if any(len(v) < 3 for v in vertices):
             raise InputError(f"{self.path}: a vertex has fewer than three coordinates")
+        positions = np.array([v[:3] for v in vertices], np.float32)
+        index = index.ravel()
+        corners, _ = triangulate(Polygons(np.array([len(p) for p in polygons]), index), positions)
         has_color = all(len(v) == 6 for v in vertices)
         has_uv, has_normal = bool((used[:, 1] >= 0).all()), bool((used[:, 2] >= 0).all())
         uvs = np.array([self.uvs[i] for i in used[:, 1]], np.float32) if has_uv else None
@@ -116,8 +121,8 @@ class _Parser:
         if any(len(v) < 3 for v in normals):
             raise InputError(f"{self.path}: a normal has fewer than three coordinates")
         return Mesh(
-            positions=np.array([v[:3] for v in vertices], np.float32),
-            faces=faces.reshape(-1, 3).astype(np.int32),
+            positions=positions,
+            faces=index[corners].astype(np.int32),
             normals=_unit(np.array(normals, np.float64)) if has_normal else None,
             uvs=uvs,
             colors=np.array([v[3:6] for v in vertices], np.float32) if has_color else None,

@@ -6,27 +6,11 @@ sharpness of the file is not evaluated. Vertices lie on the refined mesh, not on
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
 from appearance_opt.asset.normals import accumulate
-
-
-@dataclass(frozen=True)
-class Polygons:
-    """Polygons of any size: ``counts`` (F,) corners of each face, ``indices`` (sum of counts,)."""
-
-    counts: NDArray[np.int64]
-    indices: NDArray[np.int64]
-
-    def next(self) -> NDArray[np.int64]:
-        """For each corner, the position in ``indices`` of the next corner of its face."""
-        out = np.arange(1, len(self.indices) + 1)
-        ends = np.cumsum(self.counts) - 1
-        out[ends] = ends - self.counts + 1
-        return out
+from appearance_opt.asset.polygons import Polygons
 
 
 def catmull_clark(values: NDArray, polygons: Polygons, pinned_boundary: bool) -> tuple[NDArray, Polygons]:
@@ -80,13 +64,3 @@ def _vertex_points(
     curve = np.where((on_rim == 2) & (faces_around > 1), (rim / 2 + values) / 2, values)
     out = np.where(on_rim > 0, values if pinned_boundary else curve, smooth)
     return np.where(faces_around > 0, out, values)
-
-
-def triangulate(polygons: Polygons) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Fans: (T, 3) positions in ``indices`` and (T,) the face of each triangle."""
-    start = np.cumsum(polygons.counts) - polygons.counts
-    fans = np.maximum(polygons.counts - 2, 0)
-    face = np.repeat(np.arange(len(fans)), fans)
-    k = np.arange(len(face)) - np.repeat(np.cumsum(fans) - fans, fans)
-    first = start[face]
-    return np.stack([first, first + k + 1, first + k + 2], axis=1), face

@@ -11,7 +11,8 @@ import numpy as np
 
 from appearance_opt.asset.missing import Missing, MissingTextures
 from appearance_opt.asset.paths import read_bytes
-from appearance_opt.asset.subdivide import Polygons, catmull_clark, triangulate
+from appearance_opt.asset.polygons import Polygons, triangulate
+from appearance_opt.asset.subdivide import catmull_clark
 from appearance_opt.asset.types import Asset, Mesh
 from appearance_opt.asset.usd_guard import check_usd
 from appearance_opt.asset.usd_materials import MaterialReader
@@ -88,6 +89,14 @@ def _refuse_escapes(stage: Any, path: Path) -> None:
             raise InputError(f"{path}: refers to '{layer.identifier}' outside its own folder; copy it beside the file")
 
 
+def _metres_per_unit(stage: Any) -> float:
+    """The unit of a stage: centimetres if it has none. Some writers give it single precision, which
+    ``UsdGeom.GetStageMetersPerUnit`` refuses."""
+    root = stage.GetRootLayer().pseudoRoot
+    key = "metersPerUnit"
+    return float(root.GetInfo(key)) if root.HasInfo(key) else 0.01
+
+
 class _Reader:
     def __init__(self, stage: Any, path: Path, refine: int, missing_textures: MissingTextures) -> None:
         from pxr import UsdGeom
@@ -95,7 +104,7 @@ class _Reader:
         self.stage, self.path, self.refine = stage, path, refine
         self.notes: list[str] = []
         self.up = str(UsdGeom.GetStageUpAxis(stage))
-        self.unit = float(UsdGeom.GetStageMetersPerUnit(stage))
+        self.unit = _metres_per_unit(stage)
         self.to_metres = _TO_Y_UP[self.up] * self.unit
         self.materials = MaterialReader(stage, path, Missing(missing_textures, self.notes))
         self.cache = UsdGeom.XformCache()
@@ -179,7 +188,8 @@ class _Reader:
         """Triangles with one index for all attributes, one mesh per material."""
         from pxr import Gf, UsdGeom
 
-        corners, face = triangulate(values["points"][1])
+        points, polygons = values["points"]
+        corners, face = triangulate(polygons, points)
         if flipped:
             corners = corners[:, ::-1]
         matrix = np.array(Gf.Matrix4d(self.cache.GetLocalToWorldTransform(prim)))
