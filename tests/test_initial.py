@@ -60,6 +60,28 @@ def test_degenerate_and_disconnected_input_survives() -> None:
     assert np.isfinite(q).all()
 
 
+def test_a_mesh_that_lies_twice_at_one_place_costs_no_more_than_once() -> None:
+    mesh = sphere(2000, (0.0, 0.0, 0.0), 1.0, 16)
+    twice = np.concatenate([mesh.faces, np.roll(mesh.faces, 1, axis=1) + len(mesh.positions)])
+    p, f = decimate(mesh.positions, mesh.faces, 200)
+    q, g = decimate(np.concatenate([mesh.positions, mesh.positions]), twice, 200)
+    assert len(f) == len(g)
+    assert volume(q, g) == pytest.approx(volume(p, f), rel=0.01)
+    # the inside of a two-sided sheet is another face than its outside
+    _, both = decimate(mesh.positions, np.concatenate([mesh.faces, mesh.faces[:, ::-1]]), 8000)
+    assert len(both) == 2 * len(mesh.faces)
+
+
+@pytest.mark.parametrize("budget", [20, 8, 2])
+def test_a_fan_around_one_edge_reaches_its_budget(budget: int) -> None:
+    """No collapse keeps the topology where all triangles share an edge, and there is no smaller part to drop."""
+    angle = np.linspace(0, 2 * np.pi, 40, endpoint=False)
+    rim = np.stack([np.cos(angle), np.sin(angle), np.zeros(40)], axis=1)
+    p = np.concatenate([[(0, 0, -1), (0, 0, 1)], rim])
+    _, f = decimate(p, np.array([(0, 1, 2 + k) for k in range(40)]), budget)
+    assert 0 < len(f) <= budget
+
+
 @pytest.mark.parametrize(("budget", "kept"), [(300, 0.97), (700, 0.98)])
 def test_small_parts_go_before_the_large_one_suffers(budget: int, kept: float) -> None:
     rng = np.random.default_rng(0)

@@ -48,6 +48,9 @@ BOLD_PASSES = 6
 """How often a bold round chooses among the edges whose neighbourhoods are still free (Luby 1986). A pass costs a tenth
 of what the costs do. In late rounds it would take expensive edges beside cheap ones: they choose once."""
 
+STRICT, TURNING, TEARING = range(3)
+"""What a collapse may do when nothing better is left: turn faces over, then change the topology, too."""
+
 LOST = 0.03
 """What it costs to drop a connected part, in units of its weight times its diameter squared: as if its surface moved by
 a sixth of its diameter. Between 0.01 and 0.1 flight_helmet's start changes by less than a decibel."""
@@ -76,7 +79,8 @@ def decimate(
     ``positions`` (V, 3), ``faces`` (F, 3): any triangle soup; vertices at one place are welded, so that
     attribute seams are no borders. ``importance`` (F,): non-negative weight of each face, 1 by default.
     Parts that would cost more than they show are dropped as a whole. Returns welded positions and faces;
-    the count falls short of the budget by one or two at most, unless no legal collapse is left.
+    the count falls short of the budget by one or two at most, unless no legal collapse is left; none are returned if
+    no collapse whatever reaches the budget.
     """
     centre, scale = _frame(positions)
     first, place = weld(np.asarray(positions))
@@ -84,23 +88,37 @@ def decimate(
     f = place[np.asarray(faces)].astype(np.int64)
     weight = np.ones(len(f)) if importance is None else np.asarray(importance, np.float64)
     proper = (f[:, 0] != f[:, 1]) & (f[:, 1] != f[:, 2]) & (f[:, 2] != f[:, 0])
+    proper[proper] = _first_of_their_kind(f[proper], len(p))
     f, weight = f[proper], weight[proper]
     none = np.empty(0, np.int64)
     state = _State(p, vertex_quadrics(p, f, weight), f, none)
-    strict = True
-    while len(state.faces) > triangles:
-        price = _round(state, triangles, strict)
-        if price is not None:
+    for freedom in (STRICT, TURNING):
+        state.blocked = none
+        while len(state.faces) > triangles and (price := _round(state, triangles, freedom)) is not None:
             if len(state.faces) <= EARLY * triangles:
                 _drop_cheap_parts(state, triangles, price)
-            continue
-        if not strict:
-            break
-        strict, state.blocked = False, none  # no legal collapse is left: allow normals to turn
     if len(state.faces) > triangles:
         _drop_smallest_parts(state, triangles)
+        state.blocked = none
+        while len(state.faces) > triangles and _round(state, triangles, TEARING) is not None:
+            pass
+    if len(state.faces) > triangles:
+        state.faces = state.faces[:0]
     used, compact = np.unique(state.faces, return_inverse=True)
     return state.positions[used] * scale + centre, compact.reshape(-1, 3).astype(np.int32)
+
+
+def _first_of_their_kind(faces: NDArray, vertices: int) -> NDArray[np.bool_]:
+    """(F,) faces that are not the same as an earlier one: meshes that lie twice at one place would take the budget
+    twice. Two sides of a sheet are not the same."""
+    start = np.argmin(faces, axis=1)[:, None]
+    a, b, c = np.take_along_axis(faces, (start + np.arange(3)) % 3, axis=1).T
+    # one number for two corners, then one for those and the third: three may not fit into 64 bits
+    _, pair = np.unique(a * vertices + b, return_inverse=True)
+    _, first = np.unique(pair * vertices + c, return_index=True)
+    out = np.zeros(len(faces), bool)
+    out[first] = True
+    return out
 
 
 def vertex_quadrics(positions: NDArray, faces: NDArray, importance: NDArray) -> NDArray:
@@ -134,7 +152,7 @@ def _add_boundaries(total: NDArray, positions: NDArray, faces: NDArray, normals:
     accumulate(total, b, q)
 
 
-def _round(state: _State, triangles: int, strict: bool) -> float | None:
+def _round(state: _State, triangles: int, freedom: int) -> float | None:
     """Collapse an independent set of cheap edges. What the dearest of them cost (0 if none was legal); None when there
     is nothing left to try."""
     edges, uses = _edges(state.faces)
@@ -153,7 +171,7 @@ def _round(state: _State, triangles: int, strict: bool) -> float | None:
     rank = np.full(len(edges), len(edges))
     rank[cheap[_order(state, edges[cheap], cost[cheap], bold)]] = np.arange(limit)
     chosen = _independent(state, edges, rank, limit, BOLD_PASSES if bold else 1)
-    legal = _legal(state, edges[chosen], target[chosen], uses[chosen], strict)
+    legal = _legal(state, edges[chosen], target[chosen], uses[chosen], freedom)
     state.blocked = np.concatenate([state.blocked, keys[chosen[~legal]]])
     chosen = chosen[legal]
     chosen = chosen[np.argsort(rank[chosen])][:needed]
@@ -213,9 +231,9 @@ def _independent(state: _State, edges: NDArray, rank: NDArray, limit: int, passe
     return np.concatenate(chosen)
 
 
-def _legal(state: _State, edges: NDArray, target: NDArray, uses: NDArray, strict: bool) -> NDArray[np.bool_]:
+def _legal(state: _State, edges: NDArray, target: NDArray, uses: NDArray, freedom: int) -> NDArray[np.bool_]:
     """Collapses that keep the topology (link condition: the ends share as many neighbours as faces) and
-    turn no face over."""
+    turn no face over, as far as ``freedom`` demands it."""
     n = len(edges)
     if not n:
         return np.zeros(0, bool)
@@ -226,7 +244,7 @@ def _legal(state: _State, edges: NDArray, target: NDArray, uses: NDArray, strict
     owned = owner[faces]
     which = owned.max(axis=1)  # chosen edges share no face: each face has one owner
     inside = (owned >= 0).sum(axis=1)
-    legal = _link_condition(faces, which, inside, edges, uses)
+    legal = np.ones(n, bool) if freedom == TEARING else _link_condition(faces, which, inside, edges, uses)
     kept = inside == 1
     faces, owned, which = faces[kept], owned[kept], which[kept]
     before = state.positions[faces]
@@ -234,7 +252,7 @@ def _legal(state: _State, edges: NDArray, target: NDArray, uses: NDArray, strict
     normal = np.cross(before[:, 1] - before[:, 0], before[:, 2] - before[:, 0])
     moved = np.cross(after[:, 1] - after[:, 0], after[:, 2] - after[:, 0])
     sizes = np.linalg.norm(normal, axis=1) * np.linalg.norm(moved, axis=1)
-    turned = np.sum(normal * moved, axis=1) < (MINIMUM_COSINE if strict else -1.1) * sizes
+    turned = np.sum(normal * moved, axis=1) < (MINIMUM_COSINE if freedom == STRICT else -1.1) * sizes
     turned |= np.linalg.norm(moved, axis=1) < 1e-14
     legal[which[turned]] = False
     return legal
@@ -325,7 +343,7 @@ def _drop_cheap_parts(state: _State, triangles: int, price: float) -> None:
 
 
 def _drop_smallest_parts(state: _State, triangles: int) -> None:
-    """Remove whole connected parts, the smallest first, until the budget is met."""
+    """Remove whole connected parts, the smallest first, until the budget is met or the largest is left."""
     f = state.faces
     of_face = _parts(state)[f[:, 0]]
     p = state.positions[f]
@@ -334,6 +352,7 @@ def _drop_smallest_parts(state: _State, triangles: int) -> None:
     order = np.argsort(np.bincount(of_face, area))
     excess = len(f) - triangles
     gone = np.cumsum(count[order]) - count[order] < excess
+    gone[-1] = False
     state.faces = f[~np.isin(of_face, order[gone])]
 
 
