@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -91,6 +92,26 @@ def test_round_trip_through_every_writer(tmp_path: Path, ball: Asset, suffix: st
     np.testing.assert_array_equal(again.material.base_color_texture.pixels, mesh.material.base_color_texture.pixels)
     np.testing.assert_array_equal(again.material.orm_texture.pixels[..., 1:], mesh.material.orm_texture.pixels[..., 1:])
     assert {p.name for p in tmp_path.iterdir() if p.name.startswith(".")} == set()
+
+
+@pytest.mark.parametrize("suffix", [".obj", ".glb", ".usda"])
+def test_meshes_that_do_not_have_the_same_attributes(tmp_path: Path, ball: Asset, suffix: str) -> None:
+    """One without texture coordinates, one without normals, one with neither, before one with both."""
+    mesh = ball.meshes[0]
+    bare = [replace(mesh, uvs=None), replace(mesh, normals=None), replace(mesh, uvs=None, normals=None), mesh]
+    save(
+        Asset(tuple(replace(m, tangents=None, name=f"m{k}") for k, m in enumerate(bare)), "x"), tmp_path / f"x{suffix}"
+    )
+    again = load(tmp_path / f"x{suffix}").meshes
+    assert len(again) == 4
+    # normals that a format lacks are computed
+    assert [(m.uvs is not None) for m in again].count(True) == 2
+    for m in again:
+        np.testing.assert_allclose(np.ptp(m.positions, axis=0), np.ptp(mesh.positions[mesh.faces.ravel()], axis=0))
+        if m.uvs is not None:
+            np.testing.assert_allclose(
+                np.sort(m.uvs[m.faces].ravel()), np.sort(mesh.uvs[mesh.faces].ravel()), atol=1e-6
+            )
 
 
 def test_usd_up_axis_and_units(tmp_path: Path) -> None:

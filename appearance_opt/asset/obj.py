@@ -49,8 +49,9 @@ class _Parser:
         self.positions: list[list[float]] = []
         self.uvs: list[list[float]] = []
         self.normals: list[list[float]] = []
-        self.polygons: dict[str, list[list[tuple[int, int, int]]]] = {}
-        self.current: list[list[tuple[int, int, int]]] = self.polygons.setdefault("", [])
+        # by material, and by what the corners have: texture coordinates, normals
+        self.polygons: dict[tuple[str, bool, bool], list[list[tuple[int, int, int]]]] = {}
+        self.current = ""
         self.materials: dict[str, Material] = {}
         self.notes: list[str] = []
         self.missing = Missing(missing_textures, self.notes)
@@ -70,9 +71,10 @@ class _Parser:
             corners = [self._corner(w) for w in words[1:]]
             if len(corners) < 3:
                 raise ValueError
-            self.current.append(corners)
+            has_uv, has_normal = (all(c[k] >= 0 for c in corners) for k in (1, 2))
+            self.polygons.setdefault((self.current, has_uv, has_normal), []).append(corners)
         elif key == "usemtl":
-            self.current = self.polygons.setdefault(line[line.index(key) + len(key) :].strip(), [])
+            self.current = line[line.index(key) + len(key) :].strip()
         elif key == "mtllib":
             name = line.split(None, 1)[1].strip()
             path = self.missing.read(lambda: resolve(name, self.path), "default materials stand for its own")
@@ -94,12 +96,13 @@ class _Parser:
         return (out[0], out[1], out[2])
 
     def asset(self) -> Asset:
-        meshes = [self._mesh(name, p) for name, p in self.polygons.items() if p]
+        for name in dict.fromkeys(key[0] for key in self.polygons):
+            if name and name not in self.materials:
+                self.notes.append(f"material '{name}' is not defined: default material used")
+        meshes = [self._mesh(*key, p) for key, p in self.polygons.items()]
         return Asset(tuple(meshes), self.path.stem, tuple(self.notes))
 
-    def _mesh(self, name: str, polygons: list[list[tuple[int, int, int]]]) -> Mesh:
-        if name and name not in self.materials:
-            self.notes.append(f"material '{name}' is not defined: default material used")
+    def _mesh(self, name: str, has_uv: bool, has_normal: bool, polygons: list[list[tuple[int, int, int]]]) -> Mesh:
         used, index = np.unique(np.array([c for p in polygons for c in p], np.int64), axis=0, return_inverse=True)
         for k, (what, rows) in enumerate((("position", self.positions), ("uv", self.uvs), ("normal", self.normals))):
             if used[:, k].max() >= len(rows) and used[:, k].max() >= 0:
@@ -113,7 +116,6 @@ class _Parser:
         index = index.ravel()
         corners, _ = triangulate(Polygons(np.array([len(p) for p in polygons]), index), positions)
         has_color = all(len(v) == 6 for v in vertices)
-        has_uv, has_normal = bool((used[:, 1] >= 0).all()), bool((used[:, 2] >= 0).all())
         uvs = np.array([self.uvs[i] for i in used[:, 1]], np.float32) if has_uv else None
         if uvs is not None:
             uvs[:, 1] = 1 - uvs[:, 1]
@@ -204,7 +206,7 @@ def save_obj(asset: Asset, path: Path) -> None:
     with replacing(path.with_suffix(".mtl")) as temporary:
         temporary.write_text("\n".join(mtl) + "\n")
     lines = ["# appearance-opt", f"mtllib {path.stem}.mtl"]
-    start = 1
+    start = np.ones(3, np.int64)  # of this mesh's positions, texture coordinates and normals in the whole file
     for mesh in asset.meshes:
         lines += [f"o {mesh.name}", f"usemtl {named[id(mesh.material)]}"]
         colors = np.empty((len(mesh.positions), 0)) if mesh.colors is None else mesh.colors
@@ -214,14 +216,12 @@ def save_obj(asset: Asset, path: Path) -> None:
             lines += [f"vt {u:.9g} {1 - v:.9g}" for u, v in mesh.uvs.tolist()]
         if mesh.normals is not None:
             lines += [f"vn {x:.9g} {y:.9g} {z:.9g}" for x, y, z in mesh.normals.tolist()]
-        # vertices are split at seams: one index serves all three
-        form = "{0}" + ("/{0}" if mesh.uvs is not None else "/" if mesh.normals is not None else "")
-        form += "/{0}" if mesh.normals is not None else ""
-        if mesh.uvs is None and mesh.normals is None:
-            form = "{0}"
-        for face in (mesh.faces + start).tolist():
-            lines.append("f " + " ".join(form.format(i) for i in face))
-        start += len(mesh.positions)
+        # vertices are split at seams: one index serves all that a mesh has
+        has = (True, mesh.uvs is not None, mesh.normals is not None)
+        form = {(True, False): "{0}/{1}", (False, True): "{0}//{2}", (True, True): "{0}/{1}/{2}"}.get(has[1:], "{0}")
+        for face in mesh.faces.tolist():
+            lines.append("f " + " ".join(form.format(*(start + i)) for i in face))
+        start += np.where(has, len(mesh.positions), 0)
     with replacing(path) as temporary:
         temporary.write_text("\n".join(lines) + "\n")
 
