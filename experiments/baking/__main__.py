@@ -101,16 +101,17 @@ def blender(python: str, source: Path, low: Path, stem: Path, reach: float) -> d
         seconds = json.loads((folder / "seconds.json").read_text())
         apart = angles(Path(f"{stem}_closed.glb"), np.load(folder / "normal.npy"))
         tried[share] = {"cage": share * reach, "seconds": sum(seconds.values()), "seconds_by_map": seconds, **apart}
-    best = min(tried, key=lambda share: tried[share]["angle_mean"])
+    best = min(tried, key=lambda share: tried[share]["all_mean"])
     blender_asset(stem, Path(f"{stem}_blender_{best:g}"))
     return {**tried[best], "tried": tried, "same_rule": same_rule(source, low, stem, best, reach)}
 
 
 def same_rule(source: Path, low: Path, stem: Path, share: float, reach: float) -> dict:
-    """Blender's normals against ours when our rays take Blender's surface: the outermost one of the same cage."""
+    """Blender's normals against ours when our rays are Blender's: to the outermost surface of the same cage, from the
+    middle of each texel."""
     from appearance_opt import bake, bake_options
 
-    options = bake_options(closed_form=True, texture_size=SIZE, hit="outermost", cage=share * reach)
+    options = bake_options(closed_form=True, texture_size=SIZE, hit="outermost", cage=share * reach, samples=1)
     bake(source, low, f"{stem}_outermost.glb", options)
     return angles(Path(f"{stem}_outermost.glb"), np.load(f"{stem}_blender_{share:g}/normal.npy"))
 
@@ -143,7 +144,9 @@ def maps_of_blender(mesh: Mesh, folder: Path) -> Mesh:
 
 
 def angles(baked: Path, theirs: np.ndarray) -> dict:
-    """Degrees between the normal map of a file and another one, over covered texels."""
+    """Degrees between the normal map of a file and one of Blender, over covered texels ("all"), and over those whose
+    normal in Blender's map points out of LOW ("outward"). The others show the back of a triangle of HIGH, where
+    Blender's ray, unlike ours, stops: no light reaches them."""
     from appearance_opt import load
     from appearance_opt.baking.low import prepare
     from appearance_opt.baking.points import texel_coverage
@@ -155,18 +158,11 @@ def angles(baked: Path, theirs: np.ndarray) -> dict:
     vectors = [v[..., :3][covered] * 2.0 - 1 for v in (texture.linear(), theirs / 65535)]
     a, b = (v / np.maximum(np.linalg.norm(v, axis=1, keepdims=True), 1e-9) for v in vectors)
     angle = np.degrees(np.arccos(np.clip(np.sum(a * b, axis=1), -1, 1)))
-    quantiles = {f"angle_{q}": float(np.percentile(angle, q)) for q in (50, 90, 99)}
-    same = angle < SAME_SURFACE
-    return {
-        "angle_mean": float(angle.mean()),
-        "angle_mean_same": float(angle[same].mean()),
-        "other_surface": float(1 - same.mean()),
-        **quantiles,
-    }
-
-
-SAME_SURFACE = 20.0
-"""Degrees beyond which two normals are taken to be of different surfaces of HIGH."""
+    outward = b[:, 2] > 0
+    out = {"inward": float(1 - outward.mean())}
+    for name, some in (("all", angle), ("outward", angle[outward])):
+        out |= {f"{name}_mean": float(some.mean()), f"{name}_median": float(np.median(some))}
+    return out
 
 
 def judge(source: Path, candidates: dict[str, str], stem: Path, views: int) -> dict:
@@ -216,22 +212,23 @@ def cell(scores: dict) -> str:
 def tables(rows: list[dict]) -> str:
     """Markdown."""
     lines = [
-        "| asset, triangles | Blender | closed form | degrees apart: mean, median, mean < 20, share > 20 "
-        "| degrees, same rule: mean, median | times |",
-        "|---|---|---|---|---|---|",
+        "| asset, triangles | Blender | closed form | degrees apart: mean, median | Blender's inward normals "
+        "| degrees, others: mean, median | same rule, others: mean, median | times |",
+        "|---|---|---|---|---|---|---|---|",
     ]
     for r in rows:
         name = f"{r['asset']}, {r['triangles']}"
         if "blender" not in r:
             continue
         b = r["blender"]
-        degrees = ", ".join(f"{b[k]:.2f}" for k in ("angle_mean", "angle_50", "angle_mean_same"))
-        degrees += f", {100 * b['other_surface']:.1f} %"
-        same = ", ".join(f"{b['same_rule'][k]:.2f}" for k in ("angle_mean", "angle_50"))
+        degrees = [
+            ", ".join(f"{of[f'{which}_{k}']:.2f}" for k in ("mean", "median"))
+            for of, which in ((b, "all"), (b, "outward"), (b["same_rule"], "outward"))
+        ]
         ratio = b["seconds"] / r["ours"]["seconds_warm"]["closed form"]
         lines.append(
-            f"| {name} | {cell(r['scores']['blender'])} | {cell(r['scores']['closed'])} | {degrees} | {same} | "
-            f"{ratio:.1f} |"
+            f"| {name} | {cell(r['scores']['blender'])} | {cell(r['scores']['closed'])} | {degrees[0]} | "
+            f"{100 * b['inward']:.1f} % | {degrees[1]} | {degrees[2]} | {ratio:.1f} |"
         )
     lines += [
         "",
