@@ -21,7 +21,7 @@ BACKGROUNDS = ("random", "black", "white", "grey")
 LIGHTS = ("point", "headlight")
 DEVICES = ("auto", "cpu", "cuda")
 MAX_SUBDIVISION, DEFAULT_SUBDIVISION = 4, 3
-MAPS = ("normal", "material", "base-color", "orm", "displacement", "object-normal", "ao", "curvature")
+MAPS = ("normal", "material", "base-color", "orm", "displacement", "object-normal", "ao", "curvature", "emission")
 HITS = ("nearest", "outermost")
 GREENS = ("opengl", "directx")
 TEXTURE_FORMATS = ("png", "exr")
@@ -170,11 +170,11 @@ class SimplifyOptions(CommonOptions):
 class BakeOptions(CommonOptions):
     """How to bake.
 
-    ``maps``: any of ``MAPS``; "material" is base-color and orm. ``closed_form``: no fit. ``samples``: rays per texel.
-    ``cage``: how far rays go outward and inward (metres), by default from the two meshes. ``hit``: "nearest" or
-    "outermost" surface that faces the texel's way. ``green``: green channel of loose normal maps, "opengl" or
-    "directx". ``bits``: 8 or 16, of normal maps and of loose maps. ``texture_format``: of loose maps, png or exr.
-    ``ao_rays``, ``ao_distance`` (metres; by default any): ambient occlusion. ``unwrap``: make a new atlas for LOW.
+    ``maps``: any of ``MAPS``; "material" is base-color, orm and, if HIGH emits any, emission. ``closed_form``: no fit.
+    ``samples``: rays per texel. ``cage``: how far rays go outward and inward (metres), by default from the two meshes.
+    ``hit``: "nearest" or "outermost" surface that faces the texel's way. ``green``: green channel of loose normal maps,
+    "opengl" or "directx". ``bits``: 8 or 16, of normal maps and of loose maps. ``texture_format``: png or exr, of loose
+    maps. ``ao_rays``, ``ao_distance`` (metres; by default any): ambient occlusion. ``unwrap``: make LOW a new atlas.
     ``align``: fit HIGH to LOW by translation and scale. ``joint``: fit LOW's shape and a displacement map as well.
     The others: ``CommonOptions``; ``fit``: of normal,material.
     """
@@ -220,7 +220,7 @@ class BakeOptions(CommonOptions):
 
     def wants(self, name: str) -> bool:
         """Is a map asked for? "material" is base-color and orm."""
-        return name in self.maps or ("material" in self.maps and name in ("base-color", "orm"))
+        return name in self.maps or ("material" in self.maps and name in ("base-color", "orm", "emission"))
 
 
 OPTION_NAMES = frozenset(f.name for f in fields(SimplifyOptions))

@@ -23,8 +23,9 @@ _COMPRESSED = {
     "EXT_meshopt_compression": "meshopt",
     "KHR_texture_basisu": "Basis Universal",
 }
+_STRENGTH = "KHR_materials_emissive_strength"
 _SPECULAR = "KHR_materials_pbrSpecularGlossiness"
-_HARMLESS = {DRACO, _SPECULAR, "KHR_mesh_quantization", "KHR_texture_transform", "EXT_texture_webp"}
+_HARMLESS = {DRACO, _SPECULAR, _STRENGTH, "KHR_mesh_quantization", "KHR_texture_transform", "EXT_texture_webp"}
 
 
 def load_gltf(path: Path, missing_textures: MissingTextures = "error") -> Asset:
@@ -143,7 +144,12 @@ class _Reader:
         color, orm = pbr.get("baseColorTexture"), pbr.get("metallicRoughnessTexture")
         if specular is not None:  # both are made of both of its textures
             color = orm = specular.get("diffuseTexture", specular.get("specularGlossinessTexture"))
-        infos = {"base_color_texture": color, "orm_texture": orm, "normal_texture": m.get("normalTexture")}
+        infos = {
+            "base_color_texture": color,
+            "orm_texture": orm,
+            "normal_texture": m.get("normalTexture"),
+            "emission_texture": m.get("emissiveTexture"),
+        }
         return {name: info for name, info in infos.items() if info is not None}
 
     def _in_one_frame(self, meshes: list[Mesh]) -> list[Mesh]:
@@ -197,12 +203,12 @@ class _Reader:
             material = self._converted(specular, name)
         if "occlusionTexture" in m:
             self._note("occlusion ignored (it is not part of the appearance under a moving light)")
-        if "emissiveTexture" in m or any(m.get("emissiveFactor", ())):
-            self._note("emission ignored")
         mode = {"MASK": "mask", "BLEND": "blend"}.get(m.get("alphaMode", "OPAQUE"), "opaque")
         if mode != "opaque":
             self._note(f"material '{name}': transparency ignored, drawn opaque")
         normal = m.get("normalTexture")
+        strength = float(m.get("extensions", {}).get(_STRENGTH, {}).get("emissiveStrength", 1.0))
+        red, green, blue = (strength * float(x) for x in m.get("emissiveFactor", (0, 0, 0)))
         return replace(
             material,
             normal_scale=float(normal.get("scale", 1.0)) if normal else 1.0,
@@ -210,6 +216,8 @@ class _Reader:
             alpha_mode=mode,  # type: ignore[arg-type]
             alpha_cutoff=float(m.get("alphaCutoff", 0.5)),
             double_sided=bool(m.get("doubleSided", False)),
+            emission=(red, green, blue),
+            emission_texture=self._texture(m.get("emissiveTexture"), "srgb", name),
         )
 
     def _metallic(self, pbr: dict[str, Any], name: str) -> Material:

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from appearance_opt.asset.types import Asset, Displacement, Material, Mesh, Texture
 
 _WRAPS = {"repeat": 10497, "clamp": 33071, "mirror": 33648}
+EMISSIVE_STRENGTH = "KHR_materials_emissive_strength"
 _ARRAY_BUFFER, _ELEMENT_BUFFER = 34962, 34963
 
 
@@ -156,6 +157,8 @@ class _Writer:
             out["normalTexture"] = {"index": self._texture(m.normal_texture), "scale": m.normal_scale}
         if m.orm_texture is not None and m.has_occlusion:
             out["occlusionTexture"] = {"index": self._texture(m.orm_texture)}
+        if m.emits:
+            self._add_emission(out, m)
         if m.displacement is not None:
             out["extras"] = {"displacement": self._displacement(m.displacement)}
         if m.alpha_mode != "opaque":
@@ -163,6 +166,15 @@ class _Writer:
             if m.alpha_mode == "mask":
                 out["alphaCutoff"] = m.alpha_cutoff
         return out
+
+    def _add_emission(self, out: dict[str, Any], m: Material) -> None:
+        strength = max(1.0, *m.emission)  # factors end at 1
+        out["emissiveFactor"] = [x / strength for x in m.emission]
+        if m.emission_texture is not None:
+            out["emissiveTexture"] = {"index": self._texture(m.emission_texture)}
+        if strength > 1:
+            out["extensions"] = {EMISSIVE_STRENGTH: {"emissiveStrength": strength}}
+            self.json["extensionsUsed"] = [EMISSIVE_STRENGTH]
 
     def _displacement(self, given: Displacement) -> dict[str, Any]:
         d = as_16_bit(given)

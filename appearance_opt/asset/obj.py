@@ -171,6 +171,8 @@ def _material(name: str, values: dict[str, str], path: Path, notes: list[str], m
     if values.get("d", "1").split()[-1] not in ("1", "1.0", "1.000000") or "map_d" in values:
         notes.append(f"material '{name}': transparency ignored, drawn opaque")
     orm = None if rough_map is None and metal_map is None else pack_orm(rough_map, metal_map)
+    glow_map = texture("map_ke", space="srgb")
+    glow = numbers("ke", [0.0 if glow_map is None else 1.0] * 3)
     return Material(
         name=name,
         base_color=(1.0, 1.0, 1.0) if base is not None else (color[0], color[1], color[2]),
@@ -179,6 +181,8 @@ def _material(name: str, values: dict[str, str], path: Path, notes: list[str], m
         base_color_texture=base,
         orm_texture=orm,
         normal_texture=texture("norm", "map_kn"),
+        emission=(glow[0], glow[1], glow[2]),
+        emission_texture=glow_map,
     )
 
 
@@ -241,6 +245,10 @@ def _mtl_lines(m: Material, path: Path) -> list[str]:
     if m.orm_texture is not None:
         lines.append("map_Pr " + picture("roughness", m.orm_texture.pixels[..., 1:2]))
         lines.append("map_Pm " + picture("metalness", m.orm_texture.pixels[..., 2:3]))
+    if m.emits:
+        lines.append("Ke " + " ".join(f"{x:.6g}" for x in m.emission))
+        if m.emission_texture is not None:
+            lines.append("map_Ke " + picture("emission", m.emission_texture.pixels))
     if m.normal_texture is not None:
         lines.append("norm " + picture("normal", m.normal_texture.pixels[..., :3]))
     return [*lines, ""]

@@ -1,11 +1,11 @@
-"""Single-channel maps packed the way glTF does: G roughness, B metalness."""
+"""Maps packed the way glTF does: G roughness, B metalness; emission as a factor and 8 bits."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from appearance_opt.asset.types import Texture
+from appearance_opt.asset.types import Texture, linear_to_srgb
 
 
 def resized(pixels: NDArray[np.float32], height: int, width: int) -> NDArray[np.float32]:
@@ -41,3 +41,13 @@ def pack_orm(roughness: Texture | None, metalness: Texture | None) -> Texture:
         if plane is not None:
             out[..., channel] = plane
     return Texture(out, "linear", given[0].wrap)
+
+
+def pack_emission(values: NDArray[np.float32]) -> tuple[tuple[float, float, float], Texture | None]:
+    """(factor, clamped sRGB texture) of linear emission (H, W, 3). The factor is its largest value; there is no texture
+    where that is 0."""
+    strength = float(values.max(initial=0.0))
+    if strength <= 0:
+        return (0.0, 0.0, 0.0), None
+    encoded = linear_to_srgb(np.clip(values / np.float32(strength), 0, 1))
+    return (strength,) * 3, Texture((encoded * 255 + 0.5).astype(np.uint8), "srgb", ("clamp", "clamp"))

@@ -77,7 +77,8 @@ class Material:
     ``base_color``: linear RGB factor. ``orm_texture``: R occlusion (not used by the renderer; written as
     occlusion if ``has_occlusion``), G roughness, B metalness, as glTF packs them. ``displacement`` is
     written where a format has it; no renderer here reads it. ``opacity``/``alpha_mode``/``alpha_cutoff``
-    are carried for later use; opaque rendering ignores them.
+    are carried for later use; opaque rendering ignores them. ``emission``: linear RGB factor, may exceed 1, and its
+    sRGB texture: carried over, drawn by no renderer here, for it does not depend on any light.
     """
 
     name: str = "material"
@@ -94,6 +95,13 @@ class Material:
     alpha_mode: AlphaMode = "opaque"
     alpha_cutoff: float = 0.5
     double_sided: bool = True
+    emission: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    emission_texture: Texture | None = None
+
+    @property
+    def emits(self) -> bool:
+        """Does it glow? The texture is multiplied by the factor."""
+        return any(self.emission)
 
 
 @dataclass(frozen=True)

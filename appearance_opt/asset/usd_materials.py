@@ -146,19 +146,23 @@ class MaterialReader:
         opacity, _, _ = of("opacity", 1.0)
         if float(opacity) < 1:
             self.notes.append(f"material '{name}': transparency ignored, drawn opaque")
+        glow, glow_map, _ = of("emissiveColor", (0.0, 0.0, 0.0))
         base = self._texture(color_map, "srgb") if color_map else None
         rough = self._texture(rough_map, "linear", rough_channel) if rough_map else None
         metal = self._texture(metal_map, "linear", metal_channel) if metal_map else None
-        r, g, b = (1.0, 1.0, 1.0) if base else (float(x) for x in color)
+        emission = self._texture(glow_map, "srgb") if glow_map else None
         return Material(
             name=name,
-            base_color=(r, g, b),
-            roughness=1.0 if rough else float(roughness),
-            metalness=1.0 if metal else float(metalness),
+            base_color=_scale(color_map)[:3] if base else _rgb(color),
+            roughness=_scale(rough_map)[_CHANNEL.get(rough_channel, 0)] if rough else float(roughness),
+            metalness=_scale(metal_map)[_CHANNEL.get(metal_channel, 0)] if metal else float(metalness),
+            normal_scale=_normal_scale(normal_map),
             base_color_texture=base,
             orm_texture=pack_orm(rough, metal) if rough or metal else None,
             normal_texture=self._texture(normal_map, "linear") if normal_map else None,
             opacity=float(opacity),
+            emission=_scale(glow_map)[:3] if emission else _rgb(glow),
+            emission_texture=emission,
         )
 
     def _texture(self, node: Any, space: str, channel: str = "rgb") -> Texture | None:
@@ -195,6 +199,25 @@ class MaterialReader:
                 reference = str(path.resolve().relative_to(root)) if inside else text
                 self._pixels[text] = images.read(resolve(reference, self.path))
         return self._pixels[text]
+
+
+def _scale(node: Any) -> tuple[float, float, float, float]:
+    """By what a texture's values are multiplied."""
+    value = _value(node.GetInput("scale"))
+    r, g, b, a = (1.0, 1.0, 1.0, 1.0) if value is None else (float(x) for x in value)
+    return r, g, b, a
+
+
+def _normal_scale(node: Any) -> float:
+    """Strength of a normal map, whose texels become normals by a scale of 2 and a bias of -1; files that leave these
+    out mean them."""
+    value = None if node is None else _value(node.GetInput("scale"))
+    return 1.0 if value is None or value[0] <= 1 else float(value[0]) / 2
+
+
+def _rgb(value: Any) -> tuple[float, float, float]:
+    r, g, b = (float(x) for x in value)
+    return r, g, b
 
 
 def _constant(source: Any, node: Any, output: str, default: Any) -> Any:

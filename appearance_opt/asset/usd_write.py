@@ -131,6 +131,14 @@ def _material(stage: Any, target: str, m: Material, folder: Path) -> Any:
         color.ConnectToSource(node.ConnectableAPI(), "rgb")
     else:
         color.Set(Gf.Vec3f(*m.base_color))
+    if m.emits:
+        glow = shader.CreateInput("emissiveColor", types.Color3f)
+        if m.emission_texture is None:
+            glow.Set(Gf.Vec3f(*m.emission))
+        else:
+            node = sampler("emission", m.emission_texture, "sRGB")
+            node.CreateInput("scale", types.Float4).Set(Gf.Vec4f(*m.emission, 1.0))
+            glow.ConnectToSource(node.ConnectableAPI(), "rgb")
     roughness, metallic = (shader.CreateInput(k, types.Float) for k in ("roughness", "metallic"))
     if m.orm_texture is not None:
         node = sampler("orm", m.orm_texture, "raw")

@@ -18,6 +18,7 @@ from appearance_opt.baking.occlusion import exposed, openness
 from appearance_opt.baking.points import Points, TexelPoints, interpolate_packets
 from appearance_opt.baking.search import Found, Pick, automatic_reach, find
 from appearance_opt.initial.fill import fill
+from appearance_opt.reference.textures import EMISSION
 from appearance_opt.render import upload
 from appearance_opt.render.rays import sub_pixel_offsets
 from appearance_opt.render.surface import face_normal
@@ -36,6 +37,7 @@ FIELDS: dict[str, tuple[str, ...]] = {
     "displacement": ("displacement",),
     "ao": ("occlusion",),
     "curvature": ("curvature",),
+    "emission": EMISSION,
 }
 """What can be baked, and the channels of each."""
 
@@ -173,6 +175,8 @@ class _Run:
             o = self.settings
             number = points.texel + dr.opaque(mi.UInt32, seed % 2**32)
             out["ao"] = [openness(self.reference, found, number, o.ao_rays, o.ao_distance, FAR)]
+        if "emission" in fields:
+            out["emission"] = self.reference.emission_at(prim, found.b1, found.b2, points.area)
         if self.curvature is not None:
             surface = self.reference.surface
             out["curvature"] = interpolate_packets(surface, self.curvature, prim, found.b1, found.b2, 1)

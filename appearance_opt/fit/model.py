@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import drjit as dr
@@ -260,6 +260,11 @@ class Model:
         """Mesh of a tessellation level and its current positions (N, 3)."""
         drawn = self._drawn[level]
         return drawn.topology.mesh, np.array(drawn.pose(self.shape())).reshape(-1, 3)
+
+    def posed_mesh(self) -> LatentMesh:
+        """The mesh as it is drawn at the finest level, where it is now."""
+        mesh, positions = self.host_drawn(max(self.levels))
+        return replace(mesh, positions=positions)
 
     def host_displacement(self) -> NDArray[np.float32] | None:
         """Current displacement map (size, size) in the units of the positions, or None."""

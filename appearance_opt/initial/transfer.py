@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING
 from appearance_opt.baking.closed_form import BakedMaps, Settings, bake
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from appearance_opt.latent.latent import LatentMesh
     from appearance_opt.reference.mesh import MeshReference
 
@@ -18,3 +20,13 @@ def transfer(reference: MeshReference, mesh: LatentMesh, size: int, fill_hidden:
     """Base colour, roughness, metalness and tangent-space normals of the reference in ``size`` x ``size``
     maps of ``mesh``. ``fill_hidden``: smooth where nothing outside can see the reference."""
     return bake(reference, mesh, Settings(size, samples=SAMPLES, fill_hidden=fill_hidden))
+
+
+def transfer_emission(reference: MeshReference, mesh: LatentMesh, size: int) -> dict[str, NDArray | float]:
+    """What the reference emits, in maps of ``mesh`` by channel name, or as numbers where it is the same everywhere;
+    empty if it does not. Images under a light do not show it, so that no fit changes it."""
+    if reference.emission is None:
+        return {}
+    if not reference.emission.layers:
+        return dict(reference.emission.constants)
+    return {**bake(reference, mesh, Settings(size, ("emission",), samples=SAMPLES, fill_hidden=True)).maps}

@@ -181,6 +181,10 @@ class BakeJob:
 
         o, scale = self.options, self.frame[1]
         wanted = {n for n in FIELDS if o.wants(n)}
+        if self.reference.emission is None and "emission" in wanted:
+            wanted.remove("emission")
+            if "emission" in o.maps:
+                self.notes.append("HIGH emits no light: there is no emission map")
         if o.wants("base-color") or o.wants("orm"):
             wanted.add("material")
         if self._fitted_parts():

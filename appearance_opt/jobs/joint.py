@@ -69,6 +69,7 @@ def _fitted(job, light: Asset, options: BakeOptions, progress: Progress | None, 
     from appearance_opt.baking.closed_form import Settings, bake
     from appearance_opt.baking.low import movable
     from appearance_opt.fit.model import Model, Rates
+    from appearance_opt.initial.transfer import transfer_emission
     from appearance_opt.jobs.displaced import Exporter, displaced
     from appearance_opt.jobs.fitting import clean_maps, fit_start
     from appearance_opt.jobs.start import Start
@@ -94,6 +95,8 @@ def _fitted(job, light: Asset, options: BakeOptions, progress: Progress | None, 
     exporter = Exporter(np.array(job.frame[0]), job.frame[1], light.name, double_sided)
     initial = Model(mesh, start.maps, frozenset(), Rates(), start.levels[-1:])
     final = clean_maps(model, start.known)
+    if options.wants("emission"):
+        final |= transfer_emission(job.reference, model.posed_mesh(), options.texture_size)
     result = SimplifyResult(
         exporter.base(model, final),
         exporter.drawn(initial, start.maps)[initial.level],

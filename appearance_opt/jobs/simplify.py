@@ -207,6 +207,7 @@ class _Job:
     def fit(self) -> SimplifyResult:
         """Fit the start; see ``simplify``."""
         from appearance_opt.fit.model import Model, Rates
+        from appearance_opt.initial.transfer import transfer_emission
         from appearance_opt.jobs.displaced import Exporter
         from appearance_opt.jobs.fitting import clean_maps, fit_start
 
@@ -229,6 +230,7 @@ class _Job:
         initial = Model(self.start.mesh, self.start.maps, frozenset(), Rates(), self.start.levels[-1:])
         begin = exporter.drawn(initial, self.start.maps)[initial.level]
         maps = clean_maps(model, self.start.known)
+        maps |= transfer_emission(self.reference, model.posed_mesh(), o.texture_size)
         result = exporter.base(model, maps)
         tessellated = exporter.drawn(model, maps) if o.displaced else {}
         self.watch.lap("export")

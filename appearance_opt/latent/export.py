@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from appearance_opt.asset.normals import split_where_cancelled, summed_normals
+from appearance_opt.asset.packing import pack_emission
 from appearance_opt.asset.tangents import split_and_tangents
 from appearance_opt.asset.types import Asset, Material, Mesh, Texture
 
@@ -53,6 +54,10 @@ def _material(maps: Mapping[str, NDArray | float], name: str, double_sided: bool
         shapes = [v.shape for v in values if v.ndim]
         return np.stack([np.broadcast_to(v, shapes[0]) for v in values], axis=-1) if shapes else None
 
+    def numbers(*names: str) -> tuple[float, float, float]:
+        r, g, b = (float(maps.get(n, 0.0)) for n in names)
+        return r, g, b
+
     base = stacked("red", "green", "blue")
     rough_metal = stacked("roughness", "metalness")
     normal = stacked("normal_x", "normal_y", "normal_z")
@@ -61,6 +66,9 @@ def _material(maps: Mapping[str, NDArray | float], name: str, double_sided: bool
         orm = np.concatenate([np.ones((*rough_metal.shape[:2], 1), np.float32), rough_metal], axis=-1)
     if normal is not None:
         normal = normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-6)
+    glow = tuple(f"emission_{c}" for c in ("red", "green", "blue"))
+    emitted = stacked(*glow)
+    emission, emission_texture = pack_emission(emitted) if emitted is not None else (numbers(*glow), None)
     color = tuple(float(maps.get(c, 0.5)) if base is None else 1.0 for c in ("red", "green", "blue"))
     clamp = ("clamp", "clamp")
     return Material(
@@ -72,6 +80,8 @@ def _material(maps: Mapping[str, NDArray | float], name: str, double_sided: bool
         orm_texture=None if orm is None else Texture(_8(orm), "linear", clamp),  # type: ignore[arg-type]
         normal_texture=None if normal is None else Texture(_8(normal * 0.5 + 0.5), "linear", clamp),  # type: ignore[arg-type]
         double_sided=double_sided,
+        emission=emission,
+        emission_texture=emission_texture,
     )
 
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from appearance_opt.asset.normals import split_where_cancelled, summed_normals
 from appearance_opt.asset.tangents import any_tangent, split_and_tangents
-from appearance_opt.reference.textures import material_maps
+from appearance_opt.reference.textures import EMISSION, emission_maps, material_maps
 from appearance_opt.render import deferred, upload
 from appearance_opt.render.deferred import Grid
 from appearance_opt.render.freezing import Frozen
@@ -47,13 +47,15 @@ class MergedMesh:
 class MeshReference:
     """Renders an asset. Also answers what its surface looks like at given points (for the transfer).
 
-    ``merged``: the host arrays; ``scene``: for tracing rays; ``surface``, ``maps``: device data.
+    ``merged``: the host arrays; ``scene``: for tracing rays; ``surface``, ``maps``: device data; ``emission``: what
+    the materials emit, which is not rendered; None if they do not.
     """
 
     def __init__(self, asset: Asset) -> None:
         materials = list(dict.fromkeys(id(m.material) for m in asset.meshes))
         by_id = {id(m.material): m.material for m in asset.meshes}
         self.maps = material_maps([by_id[k] for k in materials])
+        self.emission = emission_maps([by_id[k] for k in materials])
         self.merged = merge(asset, [materials.index(id(m.material)) for m in asset.meshes], self.maps.has_normal_map)
         m = self.merged
         self.scene = upload.scene_of(m.positions, m.faces)
@@ -65,7 +67,7 @@ class MeshReference:
         self.surface = Surface(
             faces=upload.index_packets(m.faces, m.material),
             vertices=upload.packets(8, m.positions, padding, m.normals),
-            frames=frames if self.maps.layers else None,
+            frames=frames if self.maps.layers or (self.emission is not None and self.emission.layers) else None,
             colors=None if m.colors is None else upload.packets(4, m.colors),
             has_tangents=m.tangents is not None,
         )
@@ -118,6 +120,17 @@ class MeshReference:
             hit = interpolate_at(self.surface, triangle, b1, b2, area)
             sample = evaluate(self.maps, hit)
             return SurfaceSample(sample.base_color, sample.roughness, sample.metalness, shading_normal(hit, sample))
+
+    def emission_at(self, triangle: mi.UInt32, b1: mi.Float, b2: mi.Float, area: mi.Float) -> list[mi.Float]:
+        """Emitted linear RGB at the same points as ``sample``. Only for a reference with ``emission``."""
+        assert self.emission is not None
+        if not self.emission.layers:
+            return [mi.Float(self.emission.constants[name]) for name in EMISSION]
+        with dr.suspend_grad():
+            hit = interpolate_at(self.surface, triangle, b1, b2, area)
+            pyramid = self.emission.layers[0].pyramid
+            material = hit.material if len(pyramid.layout.sizes) > 1 else None
+            return pyramid.lookup(material, hit.uv, hit.footprint)[:3]
 
     def frame_at(self, triangle: mi.UInt32, b1: mi.Float, b2: mi.Float) -> tuple[mi.Point3f, mi.Vector3f, mi.Vector3f]:
         """(position, normal of the triangle by its winding, interpolated vertex normal), the last turned to

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
 _WRAP = {"repeat": REPEAT, "clamp": CLAMP, "mirror": MIRROR}
 _PLAIN = ("red", "green", "blue", "roughness", "metalness")
+EMISSION = ("emission_red", "emission_green", "emission_blue")
 _FULL = (*_PLAIN, "normal_x", "normal_y", "normal_z")
 
 
@@ -35,6 +36,23 @@ def material_maps(materials: list[Material]) -> MaterialMaps:
     # a material's maps share one wrap mode here: horizontal wrap of its first texture
     wraps = [_WRAP[_textures(m)[0].wrap[0]] if _textures(m) else REPEAT for m in materials]
     return MaterialMaps((TexelLayer(channels, build_pyramid(bases, wraps).halved()),))
+
+
+def emission_maps(materials: list[Material]) -> MaterialMaps | None:
+    """The same of what the materials emit, linear RGB; None if none does."""
+    if not any(m.emits for m in materials):
+        return None
+    if len(materials) == 1 and materials[0].emission_texture is None:
+        return MaterialMaps(constants=dict(zip(EMISSION, materials[0].emission, strict=True)))
+    bases, wraps = [], []
+    for m in materials:
+        texture = m.emission_texture
+        texels = np.ones((1, 1, 3), np.float32) if texture is None else texture.linear()[..., :3]
+        base = np.zeros((*texels.shape[:2], 4), np.float32)
+        base[..., :3] = texels * np.array(m.emission, np.float32)
+        bases.append(base)
+        wraps.append(REPEAT if texture is None else _WRAP[texture.wrap[0]])
+    return MaterialMaps((TexelLayer(EMISSION, build_pyramid(bases, wraps).halved()),))
 
 
 def _textures(m: Material) -> list[Texture]:
