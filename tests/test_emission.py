@@ -63,6 +63,14 @@ def test_files_without_it_have_none(tmp_path: Path, ball: Asset, suffix: str) ->
     assert MeshReference(ball).emission is None
 
 
+@pytest.mark.parametrize("suffix", [".gltf", ".usda", ".obj"])
+def test_nothing_glows_without_the_texture_that_says_where(tmp_path: Path, glowing: Asset, suffix: str) -> None:
+    save(glowing, tmp_path / f"x{suffix}")
+    for picture in tmp_path.rglob("*.png"):
+        picture.unlink()
+    assert not load(tmp_path / f"x{suffix}", missing_textures="ignore").meshes[0].material.emits
+
+
 def test_a_simplified_ball_glows_where_the_ball_does(glowing: Asset) -> None:
     result = appearance_opt.simplify(glowing, None, appearance_opt.simplify_options("draft", triangles=300, **QUICK))
     height, rgb = emitted(result.asset)

@@ -2,30 +2,26 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from appearance_opt.asset import images, specular_glossiness, uv_frames
 from appearance_opt.asset.gltf_accessors import Document
 from appearance_opt.asset.gltf_draco import DRACO, Compressed
+from appearance_opt.asset.gltf_materials import READ_EXTENSIONS, MaterialReader
 from appearance_opt.asset.missing import Missing, MissingTextures
-from appearance_opt.asset.types import Asset, Material, Mesh, Texture, Wrap
+from appearance_opt.asset.types import Asset, Mesh
 from appearance_opt.errors import InputError
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-_WRAPS: dict[int, Wrap] = {10497: "repeat", 33071: "clamp", 33648: "mirror"}
 _COMPRESSED = {
     "EXT_meshopt_compression": "meshopt",
     "KHR_texture_basisu": "Basis Universal",
 }
-_STRENGTH = "KHR_materials_emissive_strength"
-_SPECULAR = "KHR_materials_pbrSpecularGlossiness"
-_HARMLESS = {DRACO, _SPECULAR, _STRENGTH, "KHR_mesh_quantization", "KHR_texture_transform", "EXT_texture_webp"}
+_HARMLESS = {DRACO, "KHR_mesh_quantization", *READ_EXTENSIONS}
 
 
 def load_gltf(path: Path, missing_textures: MissingTextures = "error") -> Asset:
@@ -42,9 +38,7 @@ class _Reader:
         self.document = document
         self.path = document.path
         self.notes: list[str] = []
-        self.missing = Missing(missing_textures, self.notes)
-        self._images: dict[int, NDArray | None] = {}
-        self._materials: dict[int | None, Material] = {}
+        self.materials = MaterialReader(document, Missing(missing_textures, self.notes))
 
     def asset(self) -> Asset:
         self._check_extensions()
@@ -58,7 +52,7 @@ class _Reader:
         for kind, what in (("skins", "skins (bind pose kept)"), ("animations", "animations")):
             if self.document.items(kind):
                 self._note(f"{what} ignored")
-        return Asset(tuple(self._in_one_frame(meshes)), self.path.stem, tuple(self.notes))
+        return Asset(tuple(self.materials.in_one_frame(meshes)), self.path.stem, tuple(self.notes))
 
     def _note(self, text: str) -> None:
         if text not in self.notes:
@@ -122,7 +116,7 @@ class _Reader:
             tangents = np.concatenate([_normalized(t[:, :3] @ linear.T), np.where(t[:, 3:4] < 0, -1, 1)], axis=1)
         if "COLOR_0" in attributes:
             colors = read("COLOR_0")[:, :3].astype(np.float32)
-        material, channel = self._material(primitive.get("material"))
+        material, channel = self.materials.read(primitive.get("material"))
         uvs = read(f"TEXCOORD_{channel}") if f"TEXCOORD_{channel}" in attributes else None
         return Mesh(
             positions=(positions @ linear.T + world[:3, 3]).astype(np.float32),
@@ -134,151 +128,6 @@ class _Reader:
             material=material,
             name=name,
         )
-
-    def _texture_infos(self, index: int | None) -> dict[str, dict[str, Any]]:
-        """What a material says of its textures, by the name of ours."""
-        if index is None:
-            return {}
-        m = self.document.items("materials")[index]
-        pbr, specular = m.get("pbrMetallicRoughness", {}), m.get("extensions", {}).get(_SPECULAR)
-        color, orm = pbr.get("baseColorTexture"), pbr.get("metallicRoughnessTexture")
-        if specular is not None:  # both are made of both of its textures
-            color = orm = specular.get("diffuseTexture", specular.get("specularGlossinessTexture"))
-        infos = {
-            "base_color_texture": color,
-            "orm_texture": orm,
-            "normal_texture": m.get("normalTexture"),
-            "emission_texture": m.get("emissiveTexture"),
-        }
-        return {name: info for name, info in infos.items() if info is not None}
-
-    def _in_one_frame(self, meshes: list[Mesh]) -> list[Mesh]:
-        """KHR_texture_transform applied, and textures brought under one transform and wrap mode where they differ."""
-        out = list(meshes)
-        for index, material in self._materials.items():
-            own = [k for k, m in enumerate(meshes) if m.material is material and m.uvs is not None]
-            infos = self._texture_infos(index)
-            textures = {n: t for n in infos if (t := getattr(material, n)) is not None}
-            if not own or not textures:
-                continue
-            uvs = [np.asarray(meshes[k].uvs) for k in own]
-            extensions = {n: infos[n].get("extensions", {}) for n in textures}
-            frames = {n: uv_frames.affine(e.get("KHR_texture_transform")) for n, e in extensions.items()}
-            new = material
-            placed = [uv_frames.apply(next(iter(frames.values())), uv).astype(np.float32) for uv in uvs]
-            if not uv_frames.alike(uvs, textures, frames):
-                # tangents follow the coordinates, and the normal map follows the tangents
-                leading = "normal_texture" if "normal_texture" in textures else next(iter(textures))
-                unified = uv_frames.in_one_frame(uvs, textures, frames, leading)
-                differ = f"material '{material.name}': its textures differ in transform or wrap mode"
-                if unified is None:
-                    self._note(f"{differ}, and are too large to be resampled: the first one's are used for all")
-                else:
-                    self._note(f"{differ}: resampled to common texture coordinates")
-                    placed, new = unified[0], replace(material, **unified[1])  # type: ignore[arg-type]
-            for k, uv in zip(own, placed, strict=True):
-                out[k] = replace(meshes[k], uvs=uv, material=new)
-        return out
-
-    def _material(self, index: int | None) -> tuple[Material, int]:
-        """(material, index of the texture coordinates that its textures use)."""
-        infos = self._texture_infos(index)
-        channels = [
-            i.get("extensions", {}).get("KHR_texture_transform", {}).get("texCoord", i.get("texCoord", 0))
-            for i in infos.values()
-        ]
-        if len(set(channels)) > 1:
-            self._note("textures of one material use different texture coordinates: the first set is used for all")
-        if index not in self._materials:
-            self._materials[index] = Material() if index is None else self._read_material(index)
-        return self._materials[index], channels[0] if channels else 0
-
-    def _read_material(self, index: int) -> Material:
-        m = self.document.items("materials")[index]
-        name = m.get("name", f"material{index}")
-        specular = m.get("extensions", {}).get(_SPECULAR)
-        if specular is None:
-            material = self._metallic(m.get("pbrMetallicRoughness", {}), name)
-        else:
-            material = self._converted(specular, name)
-        if "occlusionTexture" in m:
-            self._note("occlusion ignored (it is not part of the appearance under a moving light)")
-        mode = {"MASK": "mask", "BLEND": "blend"}.get(m.get("alphaMode", "OPAQUE"), "opaque")
-        if mode != "opaque":
-            self._note(f"material '{name}': transparency ignored, drawn opaque")
-        normal = m.get("normalTexture")
-        strength = float(m.get("extensions", {}).get(_STRENGTH, {}).get("emissiveStrength", 1.0))
-        red, green, blue = (strength * float(x) for x in m.get("emissiveFactor", (0, 0, 0)))
-        return replace(
-            material,
-            normal_scale=float(normal.get("scale", 1.0)) if normal else 1.0,
-            normal_texture=self._texture(normal, "linear", name),
-            alpha_mode=mode,  # type: ignore[arg-type]
-            alpha_cutoff=float(m.get("alphaCutoff", 0.5)),
-            double_sided=bool(m.get("doubleSided", False)),
-            emission=(red, green, blue),
-            emission_texture=self._texture(m.get("emissiveTexture"), "srgb", name),
-        )
-
-    def _metallic(self, pbr: dict[str, Any], name: str) -> Material:
-        factor = [float(x) for x in pbr.get("baseColorFactor", (1, 1, 1, 1))]
-        return Material(
-            name=name,
-            base_color=(factor[0], factor[1], factor[2]),
-            roughness=float(pbr.get("roughnessFactor", 1.0)),
-            metalness=float(pbr.get("metallicFactor", 1.0)),
-            base_color_texture=self._texture(pbr.get("baseColorTexture"), "srgb", name),
-            orm_texture=self._texture(pbr.get("metallicRoughnessTexture"), "linear", name),
-            opacity=factor[3],
-        )
-
-    def _converted(self, given: dict[str, Any], name: str) -> Material:
-        """A specular-glossiness material as a metallic-roughness one."""
-        self._note("specular-glossiness materials converted to metallic-roughness")
-        infos = [given[k] for k in ("diffuseTexture", "specularGlossinessTexture") if k in given]
-        if len({str((i.get("texCoord"), i.get("extensions"))) for i in infos}) > 1:
-            self._note(f"material '{name}': its textures differ in transform: the first one's is used for all")
-        diffuse = [float(x) for x in given.get("diffuseFactor", (1, 1, 1, 1))]
-        specular = [float(x) for x in given.get("specularFactor", (1, 1, 1))]
-        read = specular_glossiness.Specular(
-            (diffuse[0], diffuse[1], diffuse[2]),
-            (specular[0], specular[1], specular[2]),
-            float(given.get("glossinessFactor", 1.0)),
-            self._texture(given.get("diffuseTexture"), "srgb", name),
-            self._texture(given.get("specularGlossinessTexture"), "srgb", name),
-        )
-        if read.diffuse_texture is None and read.specular_texture is None:
-            color, roughness, metalness = specular_glossiness.constants(read)
-            return Material(name, color, roughness, metalness, opacity=diffuse[3])
-        base, orm = specular_glossiness.textures(read)
-        return Material(name, (1, 1, 1), 1.0, 1.0, base_color_texture=base, orm_texture=orm, opacity=diffuse[3])
-
-    def _texture(self, info: dict[str, Any] | None, space: str, material: str) -> Texture | None:
-        if info is None:
-            return None
-        texture = self.document.items("textures")[info["index"]]
-        webp = texture.get("extensions", {}).get("EXT_texture_webp", {})
-        source = texture.get("source", webp.get("source"))
-        if source is None:
-            raise InputError(f"{self.path}: a texture of material '{material}' has no image in a supported format")
-        if source not in self._images:
-            self._images[source] = self.missing.read(lambda: self._image(source, material))
-        sampler = self.document.items("samplers")[texture["sampler"]] if "sampler" in texture else {}
-        wrap = (_WRAPS.get(sampler.get("wrapS", 0), "repeat"), _WRAPS.get(sampler.get("wrapT", 0), "repeat"))
-        pixels = self._images[source]
-        if pixels is None:
-            return None
-        if pixels.shape[2] < 3:  # grey, or grey and alpha
-            pixels = np.repeat(pixels[..., :1], 3, axis=2)
-        return Texture(pixels, space, wrap)  # type: ignore[arg-type]
-
-    def _image(self, index: int, material: str) -> NDArray:
-        image = self.document.items("images")[index]
-        if "bufferView" in image:
-            data = self.document.buffer_view(image["bufferView"])[0]
-        else:
-            data = self.document.uri(image["uri"])
-        return images.decode(data, f"{self.path}, image {image.get('name') or index} of material '{material}'")
 
 
 def _local_transform(node: dict[str, Any]) -> NDArray:

@@ -12,6 +12,7 @@ from urllib.parse import quote
 import numpy as np
 
 from appearance_opt.asset import images
+from appearance_opt.asset.gltf_materials import STRENGTH
 from appearance_opt.asset.height import as_16_bit, height_png
 from appearance_opt.asset.paths import replacing
 from appearance_opt.asset.types import linear_to_srgb
@@ -22,7 +23,6 @@ if TYPE_CHECKING:
     from appearance_opt.asset.types import Asset, Displacement, Material, Mesh, Texture
 
 _WRAPS = {"repeat": 10497, "clamp": 33071, "mirror": 33648}
-EMISSIVE_STRENGTH = "KHR_materials_emissive_strength"
 _ARRAY_BUFFER, _ELEMENT_BUFFER = 34962, 34963
 
 
@@ -173,8 +173,8 @@ class _Writer:
         if m.emission_texture is not None:
             out["emissiveTexture"] = {"index": self._texture(m.emission_texture)}
         if strength > 1:
-            out["extensions"] = {EMISSIVE_STRENGTH: {"emissiveStrength": strength}}
-            self.json["extensionsUsed"] = [EMISSIVE_STRENGTH]
+            out["extensions"] = {STRENGTH: {"emissiveStrength": strength}}
+            self.json["extensionsUsed"] = [STRENGTH]
 
     def _displacement(self, given: Displacement) -> dict[str, Any]:
         d = as_16_bit(given)

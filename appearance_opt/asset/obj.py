@@ -172,7 +172,8 @@ def _material(name: str, values: dict[str, str], path: Path, notes: list[str], m
         notes.append(f"material '{name}': transparency ignored, drawn opaque")
     orm = None if rough_map is None and metal_map is None else pack_orm(rough_map, metal_map)
     glow_map = texture("map_ke", space="srgb")
-    glow = numbers("ke", [0.0 if glow_map is None else 1.0] * 3)
+    # without the map that says where it glows, nothing does
+    glow = [0.0] * 3 if glow_map is None and "map_ke" in values else numbers("ke", [float(glow_map is not None)] * 3)
     return Material(
         name=name,
         base_color=(1.0, 1.0, 1.0) if base is not None else (color[0], color[1], color[2]),

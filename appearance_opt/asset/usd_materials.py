@@ -150,7 +150,11 @@ class MaterialReader:
         base = self._texture(color_map, "srgb") if color_map else None
         rough = self._texture(rough_map, "linear", rough_channel) if rough_map else None
         metal = self._texture(metal_map, "linear", metal_channel) if metal_map else None
-        emission = self._texture(glow_map, "srgb") if glow_map else None
+        emission, strength = None, _rgb(glow)
+        if glow_map:
+            emission = self._texture(glow_map, "srgb")
+            # without the texture that says where it glows, nothing does
+            strength = _scale(glow_map)[:3] if emission else (0.0, 0.0, 0.0)
         return Material(
             name=name,
             base_color=_scale(color_map)[:3] if base else _rgb(color),
@@ -161,7 +165,7 @@ class MaterialReader:
             orm_texture=pack_orm(rough, metal) if rough or metal else None,
             normal_texture=self._texture(normal_map, "linear") if normal_map else None,
             opacity=float(opacity),
-            emission=_scale(glow_map)[:3] if emission else _rgb(glow),
+            emission=strength,
             emission_texture=emission,
         )
 
