@@ -171,7 +171,7 @@ def test_catmull_clark_of_a_cube_tends_to_its_known_limit() -> None:
     corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], np.float64)
     quads = [0, 1, 3, 2, 4, 6, 7, 5, 0, 4, 5, 1, 2, 3, 7, 6, 0, 2, 6, 4, 1, 5, 7, 3]
     values, polygons = corners, Polygons(np.full(6, 4), np.array(quads))
-    values, polygons = catmull_clark(values, polygons, False)
+    values, polygons, _ = catmull_clark(values, polygons, False)
     assert (len(values), len(polygons.counts)) == (8 + 12 + 6, 24)
     # first level by hand: corner (F + 2R + 0 V) / 3 with F, R the means of face points and edge middles
     np.testing.assert_allclose(np.abs(values[:8]), 5 / 9, atol=1e-12)

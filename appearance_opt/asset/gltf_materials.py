@@ -52,31 +52,13 @@ class MaterialReader:
 
     def in_one_frame(self, meshes: list[Mesh]) -> list[Mesh]:
         """KHR_texture_transform applied, and textures brought under one transform and wrap mode where they differ."""
-        out = list(meshes)
+        frames_of = {}
         for index, material in self._materials.items():
-            own = [k for k, m in enumerate(meshes) if m.material is material and m.uvs is not None]
-            infos = self._texture_infos(index)
-            textures = {n: t for n in infos if (t := getattr(material, n)) is not None}
-            if not own or not textures:
-                continue
-            uvs = [np.asarray(meshes[k].uvs) for k in own]
-            extensions = {n: infos[n].get("extensions", {}) for n in textures}
-            frames = {n: uv_frames.affine(e.get("KHR_texture_transform")) for n, e in extensions.items()}
-            new = material
-            placed = [uv_frames.apply(next(iter(frames.values())), uv).astype(np.float32) for uv in uvs]
-            if not uv_frames.alike(uvs, textures, frames):
-                # tangents follow the coordinates, and the normal map follows the tangents
-                leading = "normal_texture" if "normal_texture" in textures else next(iter(textures))
-                unified = uv_frames.in_one_frame(uvs, textures, frames, leading)
-                differ = f"material '{material.name}': its textures differ in transform or wrap mode"
-                if unified is None:
-                    self._note(f"{differ}, and are too large to be resampled: the first one's are used for all")
-                else:
-                    self._note(f"{differ}: resampled to common texture coordinates")
-                    placed, new = unified[0], replace(material, **unified[1])  # type: ignore[arg-type]
-            for k, uv in zip(own, placed, strict=True):
-                out[k] = replace(meshes[k], uvs=uv, material=new)
-        return out
+            extensions = {n: info.get("extensions", {}) for n, info in self._texture_infos(index).items()}
+            frames_of[id(material)] = {
+                n: uv_frames.affine(e.get("KHR_texture_transform")) for n, e in extensions.items()
+            }
+        return uv_frames.unified(meshes, frames_of, self._note)
 
     def _texture_infos(self, index: int | None) -> dict[str, dict[str, Any]]:
         """What a material says of its textures, by the name of ours."""

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from appearance_opt.asset import images
+from appearance_opt.asset import images, uv_frames
 from appearance_opt.asset.materialx import load_materialx
 from appearance_opt.asset.packing import pack_orm
 from appearance_opt.asset.paths import resolve
-from appearance_opt.asset.types import Material, Texture
+from appearance_opt.asset.types import Material, Mesh, Texture
 from appearance_opt.errors import MissingFileError
 
 if TYPE_CHECKING:
@@ -31,6 +31,7 @@ class MaterialReader:
     def __init__(self, stage: Any, path: Path, missing: Missing) -> None:
         self.stage, self.path, self.missing, self.notes = stage, path, missing, missing.notes
         self._materials: dict[str, Material] = {}
+        self.frames: dict[int, dict[str, NDArray[np.float64]]] = {}
         self._pixels: dict[str, NDArray] = {}
 
     def bindings(self, prim: Any, mesh: Any, face_ids: NDArray) -> Iterator[tuple[Material, NDArray[np.bool_]]]:
@@ -147,27 +148,73 @@ class MaterialReader:
         if float(opacity) < 1:
             self.notes.append(f"material '{name}': transparency ignored, drawn opaque")
         glow, glow_map, _ = of("emissiveColor", (0.0, 0.0, 0.0))
-        base = self._texture(color_map, "srgb") if color_map else None
-        rough = self._texture(rough_map, "linear", rough_channel) if rough_map else None
-        metal = self._texture(metal_map, "linear", metal_channel) if metal_map else None
-        emission, strength = None, _rgb(glow)
-        if glow_map:
-            emission = self._texture(glow_map, "srgb")
-            # without the texture that says where it glows, nothing does
-            strength = _scale(glow_map)[:3] if emission else (0.0, 0.0, 0.0)
-        return Material(
+        base, base_factor = self._scaled(color_map, "srgb", "rgb", _rgb(color))
+        rough, rough_factor = self._scaled(rough_map, "linear", rough_channel, (float(roughness),) * 3)
+        metal, metal_factor = self._scaled(metal_map, "linear", metal_channel, (float(metalness),) * 3)
+        # without the texture that says where it glows, nothing does
+        emission, strength = self._scaled(glow_map, "srgb", "rgb", (0.0, 0.0, 0.0) if glow_map else _rgb(glow))
+        normal, normal_scale = self._normals(normal_map)
+        out = Material(
             name=name,
-            base_color=_scale(color_map)[:3] if base else _rgb(color),
-            roughness=_scale(rough_map)[_CHANNEL.get(rough_channel, 0)] if rough else float(roughness),
-            metalness=_scale(metal_map)[_CHANNEL.get(metal_channel, 0)] if metal else float(metalness),
-            normal_scale=_normal_scale(normal_map),
+            base_color=base_factor,
+            roughness=rough_factor[0],
+            metalness=metal_factor[0],
+            normal_scale=normal_scale,
             base_color_texture=base,
             orm_texture=pack_orm(rough, metal) if rough or metal else None,
-            normal_texture=self._texture(normal_map, "linear") if normal_map else None,
+            normal_texture=normal,
             opacity=float(opacity),
             emission=strength,
             emission_texture=emission,
         )
+        nodes = {
+            "base_color_texture": color_map,
+            "orm_texture": rough_map or metal_map,
+            "normal_texture": normal_map,
+            "emission_texture": glow_map,
+        }
+        self.frames[id(out)] = {n: _frame(node) for n, node in nodes.items() if node}
+        return out
+
+    def in_one_frame(self, meshes: list[Mesh]) -> list[Mesh]:
+        """Texture transforms applied, and textures brought under one transform and wrap mode where they differ."""
+        return uv_frames.unified(meshes, self.frames, self._note)
+
+    def _note(self, text: str) -> None:
+        if text not in self.notes:
+            self.notes.append(text)
+
+    def _scaled(
+        self, node: Any, space: str, channel: str, constant: tuple[float, float, float]
+    ) -> tuple[Texture | None, tuple[float, float, float]]:
+        """(texture or None, its factor) of an input: ``constant`` without a texture. A bias cannot be a factor, and
+        becomes part of the texture."""
+        texture = self._texture(node, space, channel) if node else None
+        if texture is None:
+            return None, constant
+        scale, bias = _vector(node, "scale", 1.0), _vector(node, "bias", 0.0)
+        if channel in _CHANNEL:
+            scale, bias = ((v[_CHANNEL[channel]],) * 3 for v in (scale, bias))
+        if not any(bias[:3]):
+            return texture, scale[:3]
+        channels = texture.pixels.shape[2]
+        values = texture.linear() * np.float32(scale[:channels]) + np.float32(bias[:channels])
+        return Texture(values, "linear", texture.wrap), (1.0, 1.0, 1.0)
+
+    def _normals(self, node: Any) -> tuple[Texture | None, float]:
+        """(normal map stored as (n + 1) / 2, strength). Normals are texels times the sampler's scale plus its bias,
+        usually 2 and -1; files that leave both out mean these."""
+        texture = self._texture(node, "linear") if node else None
+        if texture is None:
+            return None, 1.0
+        given = any(_value(node.GetInput(k)) is not None for k in ("scale", "bias"))
+        scale = _vector(node, "scale", 1.0 if given else 2.0)[:3]
+        bias = _vector(node, "bias", 0.0 if given else -1.0)[:3]
+        strength = scale[0] / 2
+        if strength > 0 and np.allclose((scale, bias), ((2 * strength, 2 * strength, 2), (-strength, -strength, -1))):
+            return texture, strength
+        normals = texture.linear()[..., :3] * np.float32(scale) + np.float32(bias)
+        return Texture(normals * np.float32(0.5) + np.float32(0.5), "linear", texture.wrap), 1.0
 
     def _texture(self, node: Any, space: str, channel: str = "rgb") -> Texture | None:
         asset = _value(node.GetInput("file"))
@@ -205,18 +252,28 @@ class MaterialReader:
         return self._pixels[text]
 
 
-def _scale(node: Any) -> tuple[float, float, float, float]:
-    """By what a texture's values are multiplied."""
-    value = _value(node.GetInput("scale"))
-    r, g, b, a = (1.0, 1.0, 1.0, 1.0) if value is None else (float(x) for x in value)
-    return r, g, b, a
+def _vector(node: Any, key: str, default: float) -> Any:
+    """Four numbers of an input of a sampler: what a texture's values are multiplied by, or what is added."""
+    value = _value(node.GetInput(key))
+    return (default,) * 4 if value is None else tuple(float(x) for x in value)
 
 
-def _normal_scale(node: Any) -> float:
-    """Strength of a normal map, whose texels become normals by a scale of 2 and a bias of -1; files that leave these
-    out mean them."""
-    value = None if node is None else _value(node.GetInput("scale"))
-    return 1.0 if value is None or value[0] <= 1 else float(value[0]) / 2
+def _frame(node: Any) -> NDArray[np.float64]:
+    """(2, 3) transform from the mesh's texture coordinates to those at which a sampler reads."""
+    from pxr import UsdShade
+
+    source = node.GetInput("st")
+    attributes = UsdShade.Utils.GetValueProducingAttributes(source) if source else []
+    if attributes:
+        transform = UsdShade.Shader(attributes[0].GetPrim())
+        if transform and str(transform.GetIdAttr().Get()) == "UsdTransform2d":
+            scale, rotation, move = (_value(transform.GetInput(k)) for k in ("scale", "rotation", "translation"))
+            return uv_frames.usd_affine(
+                (1.0, 1.0) if scale is None else tuple(scale),
+                0.0 if rotation is None else float(rotation),
+                (0.0, 0.0) if move is None else tuple(move),
+            )
+    return uv_frames.affine(None)
 
 
 def _rgb(value: Any) -> tuple[float, float, float]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,7 +12,7 @@ import numpy as np
 from appearance_opt.asset.missing import Missing, MissingTextures
 from appearance_opt.asset.paths import read_bytes
 from appearance_opt.asset.polygons import Polygons, triangulate
-from appearance_opt.asset.subdivide import catmull_clark
+from appearance_opt.asset.subdivide import Sharpness, catmull_clark
 from appearance_opt.asset.types import Asset, Mesh
 from appearance_opt.asset.usd_guard import check_usd
 from appearance_opt.asset.usd_materials import MaterialReader
@@ -36,7 +36,7 @@ def load_usd(
     variants: dict[str, str] | None = None,
     missing_textures: MissingTextures = "error",
 ) -> Asset:
-    """Read a stage at its default time, variants at their selection (or as ``variants`` says: set name ->
+    """Read a stage at its earliest time, variants at their selection (or as ``variants`` says: set name ->
     variant, on the default prim). Catmull-Clark and Loop meshes are refined ``refine`` times. Raises
     InputError."""
     from pxr import Tf, UsdUtils
@@ -97,9 +97,19 @@ def _metres_per_unit(stage: Any) -> float:
     return float(root.GetInfo(key)) if root.HasInfo(key) else 0.01
 
 
+@dataclass(frozen=True)
+class _Geometry:
+    """A mesh in its own frame. ``values``: positions ("points") and other attributes by name, each with faces of its
+    own; ``face_ids``: the file's face of each face; ``flipped``: do faces turn clockwise?"""
+
+    values: dict[str, tuple[NDArray, Polygons]]
+    face_ids: NDArray[np.int64]
+    flipped: bool
+
+
 class _Reader:
     def __init__(self, stage: Any, path: Path, refine: int, missing_textures: MissingTextures) -> None:
-        from pxr import UsdGeom
+        from pxr import Usd, UsdGeom
 
         self.stage, self.path, self.refine = stage, path, refine
         self.notes: list[str] = []
@@ -107,36 +117,78 @@ class _Reader:
         self.unit = _metres_per_unit(stage)
         self.to_metres = _TO_Y_UP[self.up] * self.unit
         self.materials = MaterialReader(stage, path, Missing(missing_textures, self.notes))
-        self.cache = UsdGeom.XformCache()
+        # the first frame of what is animated
+        self.time = Usd.TimeCode.EarliestTime()
+        self.cache = UsdGeom.XformCache(self.time)
 
     def asset(self) -> Asset:
         from pxr import Usd, UsdGeom
 
         meshes: list[Mesh] = []
-        for prim in Usd.PrimRange.Stage(self.stage, Usd.TraverseInstanceProxies()):
-            if not prim.IsA(UsdGeom.Mesh):
+        prims = iter(Usd.PrimRange.Stage(self.stage, Usd.TraverseInstanceProxies()))
+        for prim in prims:
+            if prim.IsA(UsdGeom.PointInstancer):
+                prims.PruneChildren()  # its prototypes are drawn where it says
+                meshes += self._instances(prim)
+            elif not prim.IsA(UsdGeom.Mesh):
                 if prim.IsA(UsdGeom.Gprim):
                     self._note(f"{prim.GetTypeName()} '{prim.GetPath()}' ignored: only meshes are read")
-                continue
-            imageable = UsdGeom.Imageable(prim)
-            hidden = imageable.ComputeVisibility() == UsdGeom.Tokens.invisible
-            if hidden or imageable.ComputePurpose() in (UsdGeom.Tokens.guide, UsdGeom.Tokens.proxy):
-                self._note(f"'{prim.GetPath()}' ignored: hidden, guide or proxy geometry")
-                continue
-            meshes += self._mesh(prim)
+            elif self._shown(prim):
+                meshes += self._split(prim, self._geometry(prim), self.cache.GetLocalToWorldTransform(prim))
+        meshes = self.materials.in_one_frame(meshes)
         return Asset(tuple(meshes), self.path.stem, tuple(self.notes), self.up, self.unit)  # type: ignore[arg-type]
+
+    def _shown(self, prim: Any) -> bool:
+        from pxr import UsdGeom
+
+        imageable = UsdGeom.Imageable(prim)
+        hidden = imageable.ComputeVisibility(self.time) == UsdGeom.Tokens.invisible
+        if hidden or imageable.ComputePurpose() in (UsdGeom.Tokens.guide, UsdGeom.Tokens.proxy):
+            self._note(f"'{prim.GetPath()}' ignored: hidden, guide or proxy geometry")
+            return False
+        return True
+
+    def _instances(self, prim: Any) -> list[Mesh]:
+        """The meshes of a PointInstancer's prototypes, each where an instance is."""
+        from pxr import Usd, UsdGeom
+
+        if not self._shown(prim):
+            return []
+        instancer = UsdGeom.PointInstancer(prim)
+        number = np.array(instancer.GetProtoIndicesAttr().Get(self.time) or [], np.int64)
+        shown = instancer.ComputeMaskAtTime(self.time)
+        number = number[np.array(shown, bool)] if len(shown) else number
+        transforms = instancer.ComputeInstanceTransformsAtTime(self.time, self.time)
+        world = self.cache.GetLocalToWorldTransform(prim)
+        meshes: list[Mesh] = []
+        for k, target in enumerate(instancer.GetPrototypesRel().GetForwardedTargets()):
+            root = self.stage.GetPrimAtPath(target)
+            if not root:
+                self._note(f"'{prim.GetPath()}': its prototype '{target}' does not exist")
+                continue
+            back = self.cache.GetLocalToWorldTransform(root).GetInverse()
+            for part in Usd.PrimRange(root, Usd.TraverseInstanceProxies()):
+                if part.IsA(UsdGeom.PointInstancer):
+                    self._note(f"'{part.GetPath()}' ignored: it is a prototype of another PointInstancer")
+                if not part.IsA(UsdGeom.Mesh) or not self._shown(part):
+                    continue
+                geometry, local = self._geometry(part), self.cache.GetLocalToWorldTransform(part) * back
+                for i in np.flatnonzero(number == k):
+                    meshes += self._split(part, geometry, local * transforms[int(i)] * world)
+        return meshes
 
     def _note(self, text: str) -> None:
         if text not in self.notes:
             self.notes.append(text)
 
-    def _mesh(self, prim: Any) -> list[Mesh]:
+    def _geometry(self, prim: Any) -> _Geometry:
+        """A mesh in its own frame, refined if it is a subdivision surface."""
         from pxr import UsdGeom
 
         mesh = UsdGeom.Mesh(prim)
-        points = np.array(mesh.GetPointsAttr().Get() or [], np.float64).reshape(-1, 3)
-        counts = np.array(mesh.GetFaceVertexCountsAttr().Get() or [], np.int64)
-        indices = np.array(mesh.GetFaceVertexIndicesAttr().Get() or [], np.int64)
+        points = np.array(mesh.GetPointsAttr().Get(self.time) or [], np.float64).reshape(-1, 3)
+        counts = np.array(mesh.GetFaceVertexCountsAttr().Get(self.time) or [], np.int64)
+        indices = np.array(mesh.GetFaceVertexIndicesAttr().Get(self.time) or [], np.int64)
         if counts.sum() != len(indices) or (counts < 0).any():
             raise InputError(f"{self.path}, mesh '{prim.GetPath()}': its face counts do not match its indices")
         if len(indices) and (indices.min() < 0 or indices.max() >= len(points)):
@@ -151,11 +203,40 @@ class _Reader:
             values.pop("normals", None)
             if scheme == "loop":
                 self._note("Loop subdivision surfaces are refined by the rules of Catmull-Clark")
+            sharpness = {"points": self._sharpness(mesh, len(points))}
             for _ in range(self.refine):
                 face_ids = np.repeat(face_ids, values["points"][1].counts)
-                values = {n: catmull_clark(v, p, n == "uvs") for n, (v, p) in values.items()}
+                for name, (value, where) in values.items():
+                    value, where, left = catmull_clark(value, where, name == "uvs", sharpness.get(name))
+                    values[name] = value, where
+                    if name in sharpness:
+                        sharpness[name] = left
         flipped = str(mesh.GetOrientationAttr().Get()) == "leftHanded"
-        return self._split(prim, values, face_ids, flipped)
+        return _Geometry(values, face_ids, flipped)
+
+    def _sharpness(self, mesh: Any, vertices: int) -> Sharpness:
+        """Creases and corners of a subdivision surface. Raises InputError if their numbers do not fit together."""
+
+        def numbers(attribute: Any, kind: type) -> NDArray:
+            return np.array(attribute.Get(self.time) or [], kind)
+
+        indices, lengths = (numbers(a, np.int64) for a in (mesh.GetCreaseIndicesAttr(), mesh.GetCreaseLengthsAttr()))
+        given = numbers(mesh.GetCreaseSharpnessesAttr(), np.float64)
+        corners, corner = numbers(mesh.GetCornerIndicesAttr(), np.int64), np.zeros(vertices)
+        at_corners = numbers(mesh.GetCornerSharpnessesAttr(), np.float64)
+        every = np.concatenate([indices, corners])
+        fits = lengths.sum() == len(indices) and (lengths > 1).all() and len(corners) == len(at_corners)
+        fits &= len(given) in (len(lengths), (lengths - 1).sum()) and not ((every < 0) | (every >= vertices)).any()
+        if not fits:
+            raise InputError(f"{self.path}, mesh '{mesh.GetPath()}': its creases or corners do not fit the mesh")
+        corner[corners] = at_corners
+        if not len(lengths):
+            return Sharpness(np.empty((0, 2), np.int64), np.empty(0), corner)
+        inside = np.ones(len(indices), bool)  # does the crease go on after this vertex?
+        inside[np.cumsum(lengths) - 1] = False
+        at = np.flatnonzero(inside)
+        each = given if len(given) == len(at) else np.repeat(given, lengths - 1)
+        return Sharpness(np.stack([indices[at], indices[at + 1]], axis=1), each, corner)
 
     def _primvars(self, prim: Any, mesh: Any, polygons: Polygons) -> dict[str, tuple[NDArray, Polygons]]:
         """Normals, texture coordinates and colours, each as values and faces of its own."""
@@ -165,34 +246,35 @@ class _Reader:
         out: dict[str, tuple[NDArray, Polygons]] = {}
         uv = api.GetPrimvar(self.materials.uv_name(prim))
         if uv and uv.HasValue():
-            found = _expand(uv.ComputeFlattened(), uv.GetInterpolation(), polygons, 2)
+            found = _expand(uv.ComputeFlattened(self.time), uv.GetInterpolation(), polygons, 2)
             if found is not None:
                 out["uvs"] = (np.stack([found[0][:, 0], 1 - found[0][:, 1]], axis=1), found[1])
         color = api.GetPrimvar("displayColor")
         if color and color.HasValue() and self.materials.uses_display_color(prim):
-            found = _expand(color.ComputeFlattened(), color.GetInterpolation(), polygons, 3)
+            found = _expand(color.ComputeFlattened(self.time), color.GetInterpolation(), polygons, 3)
             if found is not None:
                 out["colors"] = found
         normals = api.GetPrimvar("normals")
         value, how = None, ""
         if normals and normals.HasValue():
-            value, how = normals.ComputeFlattened(), normals.GetInterpolation()
+            value, how = normals.ComputeFlattened(self.time), normals.GetInterpolation()
         elif mesh.GetNormalsAttr().HasValue():
-            value, how = mesh.GetNormalsAttr().Get(), mesh.GetNormalsInterpolation()
+            value, how = mesh.GetNormalsAttr().Get(self.time), mesh.GetNormalsInterpolation()
         found = _expand(value, how, polygons, 3) if value is not None else None
         if found is not None:
             out["normals"] = found
         return out
 
-    def _split(self, prim: Any, values: dict, face_ids: NDArray, flipped: bool) -> list[Mesh]:
+    def _split(self, prim: Any, geometry: _Geometry, to_world: Any) -> list[Mesh]:
         """Triangles with one index for all attributes, one mesh per material."""
-        from pxr import Gf, UsdGeom
+        from pxr import UsdGeom
 
+        values, face_ids = geometry.values, geometry.face_ids
         points, polygons = values["points"]
         corners, face = triangulate(polygons, points)
-        if flipped:
+        if geometry.flipped:
             corners = corners[:, ::-1]
-        matrix = np.array(Gf.Matrix4d(self.cache.GetLocalToWorldTransform(prim)))
+        matrix = np.array(to_world)
         linear = matrix[:3, :3] @ self.to_metres.T
         offset = matrix[3, :3] @ self.to_metres.T
         if np.linalg.det(linear) < 0:

@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
     from numpy.typing import NDArray
 
-    from appearance_opt.asset.types import Texture, Wrap
+    from appearance_opt.asset.types import Mesh, Texture, Wrap
 
 MAX_TEXELS = 1 << 25
 """Texels of a resampled texture at most."""
@@ -34,9 +34,49 @@ def affine(transform: Mapping[str, Any] | None) -> NDArray[np.float64]:
     return np.concatenate([linear, np.array(t.get("offset", (0, 0)), np.float64)[:, None]], axis=1)
 
 
+def usd_affine(scale: Sequence[float], rotation: float, translation: Sequence[float]) -> NDArray[np.float64]:
+    """(2, 3) matrix of UsdTransform2d (scale, then rotation in degrees, then translation), which counts v upward, for
+    coordinates that count it downward."""
+    angle = np.radians(rotation)
+    c, s = np.cos(angle), np.sin(angle)
+    (a, b), (p, q) = np.array([[c, -s], [s, c]]) @ np.diag(np.array(scale, np.float64))
+    return np.array([[a, -b, b + translation[0]], [-p, q, 1 - q - translation[1]]])
+
+
 def apply(matrix: NDArray, points: NDArray) -> NDArray[np.float64]:
     """(N, 2) points under a (2, 3) matrix."""
     return points @ matrix[:, :2].T + matrix[:, 2]
+
+
+def unified(
+    meshes: Sequence[Mesh], frames_of: Mapping[int, Mapping[str, NDArray]], note: Callable[[str], None]
+) -> list[Mesh]:
+    """The meshes with the transforms of their textures applied, and textures brought under one transform and wrap mode
+    where they differ. ``frames_of``: by ``id`` of a material, the transform (2, 3) of each of its textures by field
+    name; materials that are not there stay. ``note``: told what was resampled."""
+    out = list(meshes)
+    for material in {id(m.material): m.material for m in meshes}.values():
+        frames = {n: f for n, f in frames_of.get(id(material), {}).items() if getattr(material, n) is not None}
+        own = [k for k, m in enumerate(meshes) if m.material is material and m.uvs is not None]
+        if not own or not frames:
+            continue
+        textures = {n: getattr(material, n) for n in frames}
+        uvs = [np.asarray(meshes[k].uvs) for k in own]
+        new = material
+        placed = [apply(next(iter(frames.values())), uv).astype(np.float32) for uv in uvs]
+        if not alike(uvs, textures, frames):
+            # tangents follow the coordinates, and the normal map follows the tangents
+            leading = "normal_texture" if "normal_texture" in textures else next(iter(textures))
+            found = in_one_frame(uvs, textures, frames, leading)
+            differ = f"material '{material.name}': its textures differ in transform or wrap mode"
+            if found is None:
+                note(f"{differ}, and are too large to be resampled: the first one's are used for all")
+            else:
+                note(f"{differ}: resampled to common texture coordinates")
+                placed, new = found[0], replace(material, **found[1])  # type: ignore[arg-type]
+        for k, uv in zip(own, placed, strict=True):
+            out[k] = replace(meshes[k], uvs=uv, material=new)
+    return out
 
 
 def alike(uvs: Sequence[NDArray], textures: Mapping[str, Texture], frames: Mapping[str, NDArray]) -> bool:
