@@ -72,6 +72,29 @@ def test_animated_meshes_are_read_at_their_first_frame(tmp_path: Path) -> None:
     np.testing.assert_allclose(load(path).meshes[0].positions.min(axis=0), [1, 0, 7])
 
 
+@pytest.mark.parametrize(
+    ("shape", "attributes", "extent", "volume"),
+    [
+        ("Cube", "double size = 3", (3, 3, 3), 27.0),
+        ("Sphere", "double radius = 2", (4, 4, 4), 4 / 3 * np.pi * 8),
+        ("Cylinder", 'double radius = 1\ndouble height = 4\nuniform token axis = "X"', (4, 2, 2), 4 * np.pi),
+        ("Cone", 'double radius = 1\ndouble height = 3\nuniform token axis = "Y"', (2, 3, 2), np.pi),
+        ("Capsule", "double radius = 1\ndouble height = 2", (2, 2, 4), 4 / 3 * np.pi + 2 * np.pi),
+        ("Plane", 'double width = 1\ndouble length = 2\nuniform token axis = "Y"', (1, 0, 2), 0.0),
+        ("Plane", 'double width = 1\ndouble length = 2\nuniform token axis = "X"', (0, 2, 1), 0.0),
+    ],
+)
+def test_shapes_have_their_size(tmp_path: Path, shape: str, attributes: str, extent: tuple, volume: float) -> None:
+    colour = 'color3f[] primvars:displayColor = [(1, 0.5, 0)] (interpolation = "constant")'
+    mesh = load(written(tmp_path, f'def {shape} "s"\n{{\n{attributes}\n{colour}\n}}\n')).meshes[0]
+    np.testing.assert_allclose(np.ptp(mesh.positions, axis=0), extent, atol=0.01)
+    p = mesh.positions[mesh.faces].astype(np.float64)
+    face = np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0])
+    assert np.einsum("ij,ij->", p[:, 0], face) / 6 == pytest.approx(volume, rel=0.01, abs=1e-9)
+    assert (np.einsum("ij,ikj->ik", face, mesh.normals[mesh.faces]) > 0).all()
+    np.testing.assert_allclose(mesh.colors, np.tile((1, 0.5, 0), (len(mesh.positions), 1)))
+
+
 def refined(sharpness: float, levels: int, corner: float = 0.0) -> np.ndarray:
     """A cube with all edges and corners as sharp as that."""
     values, polygons = CUBE, CUBE_FACES

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from appearance_opt.asset import usd_shapes
 from appearance_opt.asset.missing import Missing, MissingTextures
 from appearance_opt.asset.paths import read_bytes
 from appearance_opt.asset.polygons import Polygons, triangulate
@@ -130,11 +131,10 @@ class _Reader:
             if prim.IsA(UsdGeom.PointInstancer):
                 prims.PruneChildren()  # its prototypes are drawn where it says
                 meshes += self._instances(prim)
-            elif not prim.IsA(UsdGeom.Mesh):
-                if prim.IsA(UsdGeom.Gprim):
-                    self._note(f"{prim.GetTypeName()} '{prim.GetPath()}' ignored: only meshes are read")
-            elif self._shown(prim):
-                meshes += self._split(prim, self._geometry(prim), self.cache.GetLocalToWorldTransform(prim))
+            elif prim.IsA(UsdGeom.Gprim) and self._shown(prim):
+                geometry = self._geometry(prim)
+                if geometry is not None:
+                    meshes += self._split(prim, geometry, self.cache.GetLocalToWorldTransform(prim))
         meshes = self.materials.in_one_frame(meshes)
         return Asset(tuple(meshes), self.path.stem, tuple(self.notes), self.up, self.unit)  # type: ignore[arg-type]
 
@@ -170,9 +170,10 @@ class _Reader:
             for part in Usd.PrimRange(root, Usd.TraverseInstanceProxies()):
                 if part.IsA(UsdGeom.PointInstancer):
                     self._note(f"'{part.GetPath()}' ignored: it is a prototype of another PointInstancer")
-                if not part.IsA(UsdGeom.Mesh) or not self._shown(part):
+                geometry = self._geometry(part) if part.IsA(UsdGeom.Gprim) and self._shown(part) else None
+                if geometry is None:
                     continue
-                geometry, local = self._geometry(part), self.cache.GetLocalToWorldTransform(part) * back
+                local = self.cache.GetLocalToWorldTransform(part) * back
                 for i in np.flatnonzero(number == k):
                     meshes += self._split(part, geometry, local * transforms[int(i)] * world)
         return meshes
@@ -181,8 +182,24 @@ class _Reader:
         if text not in self.notes:
             self.notes.append(text)
 
-    def _geometry(self, prim: Any) -> _Geometry:
-        """A mesh in its own frame, refined if it is a subdivision surface."""
+    def _geometry(self, prim: Any) -> _Geometry | None:
+        """A mesh or a shape in its own frame; None, with a note, if it is something else."""
+        from pxr import UsdGeom
+
+        flipped = str(UsdGeom.Gprim(prim).GetOrientationAttr().Get()) == "leftHanded"
+        if prim.IsA(UsdGeom.Mesh):
+            return _Geometry(*self._mesh(prim), flipped)
+        found = usd_shapes.triangles(prim, self.time)
+        if found is None:
+            self._note(f"{prim.GetTypeName()} '{prim.GetPath()}' ignored: only surfaces are read")
+            return None
+        positions, normals, faces = found
+        polygons = Polygons(np.full(len(faces), 3), faces.ravel())
+        values = {"points": (positions, polygons), "normals": (normals, polygons), **self._colors(prim, polygons)}
+        return _Geometry(values, np.arange(len(faces)), flipped)
+
+    def _mesh(self, prim: Any) -> tuple[dict[str, tuple[NDArray, Polygons]], NDArray[np.int64]]:
+        """Attributes and the file's faces of a mesh, refined if it is a subdivision surface (see ``_Geometry``)."""
         from pxr import UsdGeom
 
         mesh = UsdGeom.Mesh(prim)
@@ -211,8 +228,7 @@ class _Reader:
                     values[name] = value, where
                     if name in sharpness:
                         sharpness[name] = left
-        flipped = str(mesh.GetOrientationAttr().Get()) == "leftHanded"
-        return _Geometry(values, face_ids, flipped)
+        return values, face_ids
 
     def _sharpness(self, mesh: Any, vertices: int) -> Sharpness:
         """Creases and corners of a subdivision surface. Raises InputError if their numbers do not fit together."""
@@ -249,11 +265,7 @@ class _Reader:
             found = _expand(uv.ComputeFlattened(self.time), uv.GetInterpolation(), polygons, 2)
             if found is not None:
                 out["uvs"] = (np.stack([found[0][:, 0], 1 - found[0][:, 1]], axis=1), found[1])
-        color = api.GetPrimvar("displayColor")
-        if color and color.HasValue() and self.materials.uses_display_color(prim):
-            found = _expand(color.ComputeFlattened(self.time), color.GetInterpolation(), polygons, 3)
-            if found is not None:
-                out["colors"] = found
+        out |= self._colors(prim, polygons)
         normals = api.GetPrimvar("normals")
         value, how = None, ""
         if normals and normals.HasValue():
@@ -264,6 +276,15 @@ class _Reader:
         if found is not None:
             out["normals"] = found
         return out
+
+    def _colors(self, prim: Any, polygons: Polygons) -> dict[str, tuple[NDArray, Polygons]]:
+        from pxr import UsdGeom
+
+        color = UsdGeom.PrimvarsAPI(prim).GetPrimvar("displayColor")
+        found = None
+        if color and color.HasValue() and self.materials.uses_display_color(prim):
+            found = _expand(color.ComputeFlattened(self.time), color.GetInterpolation(), polygons, 3)
+        return {} if found is None else {"colors": found}
 
     def _split(self, prim: Any, geometry: _Geometry, to_world: Any) -> list[Mesh]:
         """Triangles with one index for all attributes, one mesh per material."""
