@@ -91,6 +91,9 @@ RefineOption = Annotated[int | None, typer.Option(help="Level to which USD subdi
 MissingTexturesOption = Annotated[
     str | None, typer.Option(help="error or ignore, when the input names a texture that is not there.")
 ]
+RootOption = Annotated[
+    str | None, typer.Option(help="Folder in which files that the input refers to may lie, beside its own.")
+]
 DeviceOption = Annotated[str | None, typer.Option(help="auto, cpu or cuda.")]
 ReportOption = Annotated[Path | None, typer.Option(help="Folder for the report [OUT's name + .report].")]
 NoReportOption = Annotated[bool, typer.Option("--no-report", help="Write no report.")]
@@ -143,6 +146,7 @@ def simplify(
     normal_map: Annotated[bool | None, typer.Option(help="Make a normal map at all.")] = None,
     refine: RefineOption = None,
     missing_textures: MissingTexturesOption = None,
+    root: RootOption = None,
     variant: Annotated[list[str] | None, typer.Option(help="USD variant: set=name (repeatable).")] = None,
     device: DeviceOption = None,
     report: ReportOption = None,
@@ -191,7 +195,7 @@ def bake(
     out: Annotated[Path, typer.Option(help="Result: .glb .gltf .usd* .obj")],
     maps: Annotated[
         str | None,
-        typer.Option(help="normal,material,base-color,orm,displacement,object-normal,ao,curvature."),
+        typer.Option(help="normal,material,base-color,orm,emission,displacement,object-normal,ao,curvature."),
     ] = None,
     closed_form: Annotated[bool | None, typer.Option("--closed-form", help="Rays alone, no fit: seconds.")] = None,
     fit: Annotated[str | None, typer.Option(help="Subset of normal,material.")] = None,
@@ -222,6 +226,7 @@ def bake(
     seed: SeedOption = None,
     refine: RefineOption = None,
     missing_textures: MissingTexturesOption = None,
+    root: RootOption = None,
     variant: Annotated[list[str] | None, typer.Option(help="USD variant of HIGH: set=name (repeatable).")] = None,
     device: DeviceOption = None,
     joint: Annotated[bool | None, typer.Option("--joint", help="Fit LOW's shape and a displacement, too.")] = None,
@@ -291,6 +296,7 @@ def compare(
     seed: Annotated[int, typer.Option(help="Seed of views and lights.")] = 0,
     device: Annotated[str, typer.Option(help="auto, cpu or cuda.")] = "auto",
     missing_textures: MissingTexturesOption = "error",
+    root: RootOption = None,
 ) -> None:
     """Measure how different two assets look: PSNR, FLIP, silhouettes."""
     from appearance_opt.jobs.compare import compare as run
@@ -304,6 +310,7 @@ def compare(
         device=device,
         out=out,
         missing_textures=missing_textures,  # type: ignore[arg-type]
+        root=root,
     )
     for note in result.notes:
         print(f"note: {note}", file=sys.stderr)
@@ -327,6 +334,7 @@ def inspect(
     as_json: Annotated[bool, typer.Option("--json", help="Print as JSON.")] = False,
     refine: Annotated[int, typer.Option(help="Level to which USD subdivision surfaces are refined.")] = 1,
     missing_textures: MissingTexturesOption = "error",
+    root: RootOption = None,
     variant: Annotated[list[str] | None, typer.Option(help="USD variant: set=name (repeatable).")] = None,
 ) -> None:
     """Say what is in an asset and what is wrong with it."""
@@ -335,7 +343,8 @@ def inspect(
     from appearance_opt.asset import load
     from appearance_opt.asset.validate import validate
 
-    asset = load(source, refine=refine, variants=_variants(variant), missing_textures=missing_textures)  # type: ignore[arg-type]
+    given = {"variants": _variants(variant), "missing_textures": missing_textures, "root": root}
+    asset = load(source, refine=refine, **given)  # type: ignore[arg-type]
     found = {"meshes": len(asset.meshes), **asdict(validate(asset)), "notes": list(asset.notes)}
     if as_json:
         import json

@@ -10,8 +10,8 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
-from appearance_opt.asset.missing import CHOICES as MISSING_TEXTURES
-from appearance_opt.asset.missing import MissingTextures
+from appearance_opt.asset.companions import CHOICES as MISSING_TEXTURES
+from appearance_opt.asset.companions import MissingTextures
 from appearance_opt.errors import InputError
 
 FIT_PARTS = ("shape", "normal", "material", "gamma")
@@ -45,6 +45,7 @@ class CommonOptions:
     a new one takes its place (0: they stay). ``fit``: what moves. ``*_rate``: learning rates, positions in units of
     the local edge length; by default they follow from how good the start is. ``refine``: level for USD subdivision
     surfaces. ``missing_textures``: "error" or "ignore", when an input names a texture that is not there.
+    ``root``: folder in which files that inputs refer to may lie, beside their own.
     ``subdivision``: tessellation levels of a displaced result (none given: 3); ``write_tessellated``: write those
     meshes, too. Raises InputError for values that make no sense.
     """
@@ -68,6 +69,7 @@ class CommonOptions:
     seed: int = 0
     refine: int = 1
     missing_textures: MissingTextures = "error"
+    root: str | None = None
     subdivision: tuple[int, ...] = ()
     write_tessellated: bool = False
     device: str = "auto"

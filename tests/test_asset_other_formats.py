@@ -11,7 +11,7 @@ import trimesh
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from appearance_opt.asset import load, save
+from appearance_opt.asset import images, load, save
 from appearance_opt.asset.polygons import Polygons
 from appearance_opt.asset.subdivide import catmull_clark
 from appearance_opt.asset.types import Asset
@@ -122,6 +122,51 @@ def test_usd_up_axis_and_units(tmp_path: Path) -> None:
     )
     p = load(tmp_path / "x.usda").meshes[0].positions
     np.testing.assert_allclose(p[np.lexsort(p.T)], [[0, 0, 0], [1, 0, 0], [0, 2, 0]], atol=1e-6)
+
+
+def test_a_root_allows_files_outside_of_the_own_folder(tmp_path: Path, ball: Asset) -> None:
+    """As productions lay them out: an asset refers to a folder beside its own."""
+    for name in ("library", "shot"):
+        (tmp_path / name).mkdir()
+    save(ball, tmp_path / "library" / "ball.usda")
+    scene = tmp_path / "shot" / "scene.usda"
+    scene.write_text('#usda 1.0\n(metersPerUnit = 1\nupAxis = "Y"\nsubLayers = [@../library/ball.usda@])\n')
+    with pytest.raises(InputError, match=r"outside its own folder.*--root"):
+        load(scene)
+    with pytest.raises(InputError, match="no such folder"):
+        load(scene, root=tmp_path / "absent")
+    with pytest.raises(InputError, match="outside its own folder"):
+        load(scene, root=tmp_path / "shot")
+    mesh = load(scene, root=tmp_path).meshes[0]
+    assert len(mesh.faces) == len(ball.meshes[0].faces)
+    assert mesh.material.base_color_texture is not None
+
+
+def test_several_material_files_in_one_statement(tmp_path: Path) -> None:
+    (tmp_path / "b.mtl").write_text("newmtl green\nKd 0 1 0\n")
+    (tmp_path / "with space.mtl").write_text("newmtl red\nKd 1 0 0\n")
+    path = tmp_path / "x.obj"
+    text = "v 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl {}\nf 1 2 3\n"
+    path.write_text("mtllib a.mtl b.mtl\n" + text.format("green"))
+    with pytest.raises(InputError, match=r"a\.mtl.*does not exist"):
+        load(path)
+    assert load(path, missing_textures="ignore").meshes[0].material.base_color == (0, 1, 0)
+    path.write_text("mtllib with space.mtl\n" + text.format("red"))
+    assert load(path).meshes[0].material.base_color == (1, 0, 0)
+
+
+def test_normals_that_an_obj_file_does_not_have_are_ignored(tmp_path: Path) -> None:
+    path = tmp_path / "x.obj"
+    path.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1//7 2//8 3//9\n")
+    asset = load(path)
+    assert asset.meshes[0].normals is None or np.isfinite(asset.meshes[0].normals).all()
+    assert any("normals" in note for note in asset.notes)
+
+
+def test_tga_textures_in_memory(tmp_path: Path) -> None:
+    pixels = np.array([[(255, 0, 0), (0, 255, 0)], [(0, 0, 255), (9, 8, 7)]], np.uint8)
+    head = bytes([0, 0, 2, 0, 0, 0, 0, 0, 0, 0, 0, 0, 2, 0, 2, 0, 24, 0x20])  # uncompressed, rows from the top
+    np.testing.assert_array_equal(images.decode(head + pixels[..., ::-1].tobytes(), "x"), pixels)
 
 
 def test_usd_reference_outside_its_folder_is_refused(tmp_path: Path) -> None:

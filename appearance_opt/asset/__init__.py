@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from appearance_opt.asset.missing import CHOICES, MissingTextures
+from appearance_opt.asset.companions import CHOICES, Companions, MissingTextures
 from appearance_opt.asset.types import Asset, Displacement, Material, Mesh, Texture
 from appearance_opt.errors import InputError
 
@@ -20,14 +20,15 @@ def load(
     refine: int = 1,
     variants: dict[str, str] | None = None,
     missing_textures: MissingTextures = "error",
+    root: str | Path | None = None,
 ) -> Asset:
     """Read an asset; the suffix chooses the format. Units become metres, the up axis +Y.
 
     ``refine``: level to which USD subdivision surfaces are refined. ``variants``: USD variant
     selections by set name, instead of those in the file. ``missing_textures``: "error" refuses an asset that names
     a texture file which is not there, "ignore" goes on with the material's constants (without a normal map, if it is
-    that) and a note. Harmless faults are repaired and noted in ``Asset.notes``. Raises InputError for everything
-    else, naming the file.
+    that) and a note. ``root``: folder in which files that it refers to may lie, beside its own. Harmless faults
+    are repaired and noted in ``Asset.notes``. Raises InputError for everything else, naming the file.
     """
     path = Path(path)
     if missing_textures not in CHOICES:
@@ -37,6 +38,8 @@ def load(
         raise InputError(f"{path}: unknown format '{suffix}'; readable are {' '.join(READABLE)}")
     if not path.is_file():
         raise InputError(f"{path}: no such file")
+    if root is not None and not Path(root).is_dir():
+        raise InputError(f"--root {root}: no such folder")
     import numpy as np
 
     from appearance_opt.asset.validate import repair
@@ -44,29 +47,28 @@ def load(
     try:
         # numbers that do not fit a float32 become infinite, which ``repair`` refuses by name
         with np.errstate(over="ignore", invalid="ignore"):
-            return repair(_read(path, suffix, refine, variants, missing_textures), str(path))
+            companions = Companions(missing_textures, None if root is None else Path(root))
+            return repair(_read(path, suffix, refine, variants, companions), str(path))
     except MemoryError as error:
         raise InputError(f"{path}: asks for more memory than there is; it is damaged or too large") from error
 
 
-def _read(
-    path: Path, suffix: str, refine: int, variants: dict[str, str] | None, missing_textures: MissingTextures
-) -> Asset:
+def _read(path: Path, suffix: str, refine: int, variants: dict[str, str] | None, companions: Companions) -> Asset:
     if suffix in (".glb", ".gltf"):
         from appearance_opt.asset.gltf_read import load_gltf
 
-        return load_gltf(path, missing_textures)
+        return load_gltf(path, companions)
     if suffix == ".obj":
         from appearance_opt.asset.obj import load_obj
 
-        return load_obj(path, missing_textures)
+        return load_obj(path, companions)
     if suffix in (".ply", ".stl"):
         from appearance_opt.asset.geometry import load_geometry
 
         return load_geometry(path)
     from appearance_opt.asset.usd_read import load_usd
 
-    return load_usd(path, refine, variants, missing_textures)
+    return load_usd(path, refine, variants, companions)
 
 
 def save(asset: Asset, path: str | Path) -> None:

@@ -11,11 +11,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from appearance_opt.asset.paths import read_bytes, resolve
+from appearance_opt.asset.paths import read_bytes
 from appearance_opt.errors import InputError
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
+
+    from appearance_opt.asset.companions import Companions
 
 COMPONENTS = {5120: np.int8, 5121: np.uint8, 5122: np.int16, 5123: np.uint16, 5125: np.uint32, 5126: np.float32}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
@@ -28,8 +30,8 @@ _MAGIC, _JSON, _BIN = 0x46546C67, 0x4E4F534A, 0x004E4942
 class Document:
     """A parsed glTF or GLB file: its JSON, and its buffers, read when asked for."""
 
-    def __init__(self, path: Path) -> None:
-        self.path = Path(path)
+    def __init__(self, path: Path, companions: Companions) -> None:
+        self.path, self.companions = Path(path), companions
         data = read_bytes(self.path)
         text, self._binary = _chunks(data, self.path) if data[:4] == b"glTF" else (data, None)
         try:
@@ -55,7 +57,7 @@ class Document:
                 return base64.b64decode(uri.split(",", 1)[1], validate=True)
             except (IndexError, binascii.Error):
                 raise InputError(f"{self.path}: a data URI is damaged") from None
-        return read_bytes(resolve(uri, self.path, percent_encoded=True))
+        return read_bytes(self.companions.find(uri, self.path, percent_encoded=True))
 
     def buffer_view(self, index: int) -> tuple[bytes, int]:
         """(bytes, stride or 0) of a buffer view."""

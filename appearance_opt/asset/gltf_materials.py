@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from appearance_opt.asset.gltf_accessors import Document
-    from appearance_opt.asset.missing import Missing
 
 STRENGTH = "KHR_materials_emissive_strength"
 SPECULAR = "KHR_materials_pbrSpecularGlossiness"
@@ -26,16 +25,13 @@ _WRAPS: dict[int, Wrap] = {10497: "repeat", 33071: "clamp", 33648: "mirror"}
 
 
 class MaterialReader:
-    """Materials of a file, each read once. Notes go where ``missing`` keeps its own."""
+    """Materials of a file, each read once."""
 
-    def __init__(self, document: Document, missing: Missing) -> None:
-        self.document, self.path, self.missing = document, document.path, missing
+    def __init__(self, document: Document) -> None:
+        self.document, self.path = document, document.path
+        self.note = document.companions.note
         self._images: dict[int, NDArray | None] = {}
         self._materials: dict[int | None, Material] = {}
-
-    def _note(self, text: str) -> None:
-        if text not in self.missing.notes:
-            self.missing.notes.append(text)
 
     def read(self, index: int | None) -> tuple[Material, int]:
         """(material, index of the texture coordinates that its textures use)."""
@@ -45,7 +41,7 @@ class MaterialReader:
             for i in infos.values()
         ]
         if len(set(channels)) > 1:
-            self._note("textures of one material use different texture coordinates: the first set is used for all")
+            self.note("textures of one material use different texture coordinates: the first set is used for all")
         if index not in self._materials:
             self._materials[index] = Material() if index is None else self._read_material(index)
         return self._materials[index], channels[0] if channels else 0
@@ -58,7 +54,7 @@ class MaterialReader:
             frames_of[id(material)] = {
                 n: uv_frames.affine(e.get("KHR_texture_transform")) for n, e in extensions.items()
             }
-        return uv_frames.unified(meshes, frames_of, self._note)
+        return uv_frames.unified(meshes, frames_of, self.note)
 
     def _texture_infos(self, index: int | None) -> dict[str, dict[str, Any]]:
         """What a material says of its textures, by the name of ours."""
@@ -86,10 +82,10 @@ class MaterialReader:
         else:
             material = self._converted(specular, name)
         if "occlusionTexture" in m:
-            self._note("occlusion ignored (it is not part of the appearance under a moving light)")
+            self.note("occlusion ignored (it is not part of the appearance under a moving light)")
         mode = {"MASK": "mask", "BLEND": "blend"}.get(m.get("alphaMode", "OPAQUE"), "opaque")
         if mode != "opaque":
-            self._note(f"material '{name}': transparency ignored, drawn opaque")
+            self.note(f"material '{name}': transparency ignored, drawn opaque")
         normal = m.get("normalTexture")
         emission, emission_texture = self._emission(m, name)
         return replace(
@@ -128,10 +124,10 @@ class MaterialReader:
 
     def _converted(self, given: dict[str, Any], name: str) -> Material:
         """A specular-glossiness material as a metallic-roughness one."""
-        self._note("specular-glossiness materials converted to metallic-roughness")
+        self.note("specular-glossiness materials converted to metallic-roughness")
         infos = [given[k] for k in ("diffuseTexture", "specularGlossinessTexture") if k in given]
         if len({str((i.get("texCoord"), i.get("extensions"))) for i in infos}) > 1:
-            self._note(f"material '{name}': its textures differ in transform: the first one's is used for all")
+            self.note(f"material '{name}': its textures differ in transform: the first one's is used for all")
         diffuse = [float(x) for x in given.get("diffuseFactor", (1, 1, 1, 1))]
         specular = [float(x) for x in given.get("specularFactor", (1, 1, 1))]
         read = specular_glossiness.Specular(
@@ -156,7 +152,7 @@ class MaterialReader:
         if source is None:
             raise InputError(f"{self.path}: a texture of material '{material}' has no image in a supported format")
         if source not in self._images:
-            self._images[source] = self.missing.read(lambda: self._image(source, material))
+            self._images[source] = self.document.companions.read(lambda: self._image(source, material))
         sampler = self.document.items("samplers")[texture["sampler"]] if "sampler" in texture else {}
         wrap = (_WRAPS.get(sampler.get("wrapS", 0), "repeat"), _WRAPS.get(sampler.get("wrapT", 0), "repeat"))
         pixels = self._images[source]

@@ -10,12 +10,13 @@ import numpy as np
 from appearance_opt.asset.gltf_accessors import Document
 from appearance_opt.asset.gltf_draco import DRACO, Compressed
 from appearance_opt.asset.gltf_materials import READ_EXTENSIONS, MaterialReader
-from appearance_opt.asset.missing import Missing, MissingTextures
 from appearance_opt.asset.types import Asset, Mesh
 from appearance_opt.errors import InputError
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
+
+    from appearance_opt.asset.companions import Companions
 
 _COMPRESSED = {
     "EXT_meshopt_compression": "meshopt",
@@ -24,21 +25,21 @@ _COMPRESSED = {
 _HARMLESS = {DRACO, "KHR_mesh_quantization", *READ_EXTENSIONS}
 
 
-def load_gltf(path: Path, missing_textures: MissingTextures = "error") -> Asset:
+def load_gltf(path: Path, companions: Companions) -> Asset:
     """Read a .gltf or .glb file. Raises InputError."""
-    document = Document(path)
+    document = Document(path, companions)
     try:
-        return _Reader(document, missing_textures).asset()
+        return _Reader(document).asset()
     except (KeyError, IndexError, TypeError, AttributeError, ValueError, OverflowError, RecursionError) as error:
         raise InputError(f"{path}: the glTF structure is broken ({type(error).__name__}: {error})") from error
 
 
 class _Reader:
-    def __init__(self, document: Document, missing_textures: MissingTextures) -> None:
+    def __init__(self, document: Document) -> None:
         self.document = document
         self.path = document.path
-        self.notes: list[str] = []
-        self.materials = MaterialReader(document, Missing(missing_textures, self.notes))
+        self.note = document.companions.note
+        self.materials = MaterialReader(document)
 
     def asset(self) -> Asset:
         self._check_extensions()
@@ -51,12 +52,8 @@ class _Reader:
             self._visit(root, np.eye(4), meshes, set())
         for kind, what in (("skins", "skins (bind pose kept)"), ("animations", "animations")):
             if self.document.items(kind):
-                self._note(f"{what} ignored")
-        return Asset(tuple(self.materials.in_one_frame(meshes)), self.path.stem, tuple(self.notes))
-
-    def _note(self, text: str) -> None:
-        if text not in self.notes:
-            self.notes.append(text)
+                self.note(f"{what} ignored")
+        return Asset(tuple(self.materials.in_one_frame(meshes)), self.path.stem, tuple(self.document.companions.notes))
 
     def _check_extensions(self) -> None:
         for name in self.document.json.get("extensionsRequired", []):
@@ -66,7 +63,7 @@ class _Reader:
                 )
         for name in self.document.json.get("extensionsUsed", []):
             if name not in _HARMLESS:
-                self._note(f"extension {name} ignored")
+                self.note(f"extension {name} ignored")
 
     def _visit(self, index: int, parent: NDArray, meshes: list[Mesh], seen: set[int]) -> None:
         if index in seen:
@@ -86,10 +83,10 @@ class _Reader:
     def _primitive(self, primitive: dict[str, Any], world: NDArray, name: str) -> Mesh | None:
         mode = primitive.get("mode", 4)
         if mode not in (4, 5, 6):
-            self._note("points and lines ignored")
+            self.note("points and lines ignored")
             return None
         if primitive.get("targets"):
-            self._note("morph targets ignored")
+            self.note("morph targets ignored")
         attributes = primitive["attributes"]
         compressed = Compressed.of(self.document, primitive)
 

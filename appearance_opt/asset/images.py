@@ -148,7 +148,12 @@ def _suffix(data: bytes, name: str) -> str:
     for head, suffix in magic:
         if data.startswith(head):
             return suffix
-    raise InputError(f"{name}: not a readable image (neither PNG, JPEG, EXR, TIFF, WebP, BMP nor HDR)")
+    if len(data) > 18 and data[1] <= 1 and data[2] in _TGA_TYPES and data[16] in (8, 15, 16, 24, 32):
+        return ".tga"  # it has no magic number
+    raise InputError(f"{name}: not a readable image (neither PNG, JPEG, EXR, TIFF, WebP, BMP, TGA nor HDR)")
+
+
+_TGA_TYPES = (1, 2, 3, 9, 10, 11)
 
 
 def _one_line(text: str) -> str:

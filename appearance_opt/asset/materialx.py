@@ -10,17 +10,17 @@ import numpy as np
 
 from appearance_opt.asset import images
 from appearance_opt.asset.packing import pack_orm
-from appearance_opt.asset.paths import read_bytes, resolve
+from appearance_opt.asset.paths import read_bytes
 from appearance_opt.asset.types import Material, Texture
 from appearance_opt.errors import InputError
 
 if TYPE_CHECKING:
     from xml.etree.ElementTree import Element
 
-    from appearance_opt.asset.missing import Missing
+    from appearance_opt.asset.companions import Companions
 
 
-def load_materialx(path: Path, name: str, missing: Missing) -> Material | None:
+def load_materialx(path: Path, name: str, companions: Companions) -> Material | None:
     """The surface material ``name`` of a .mtlx file, or None if it is not there. Raises InputError."""
     try:
         root = ElementTree.fromstring(read_bytes(path))
@@ -31,12 +31,12 @@ def load_materialx(path: Path, name: str, missing: Missing) -> Material | None:
         return None
     link = material.find("./input[@name='surfaceshader']")
     shader = None if link is None else root.find(f"./standard_surface[@name='{link.get('nodename')}']")
-    return None if shader is None else _Shader(root, shader, path, missing).material(name)
+    return None if shader is None else _Shader(root, shader, path, companions).material(name)
 
 
 class _Shader:
-    def __init__(self, root: Element, shader: Element, path: Path, missing: Missing) -> None:
-        self.root, self.shader, self.path, self.missing = root, shader, path, missing
+    def __init__(self, root: Element, shader: Element, path: Path, companions: Companions) -> None:
+        self.root, self.shader, self.path, self.companions = root, shader, path, companions
 
     def material(self, name: str) -> Material:
         base, rough, metal = (self._texture(k) for k in ("base_color", "specular_roughness", "metalness"))
@@ -83,7 +83,7 @@ class _Shader:
         if file is None or not file.get("value"):
             return None
         reference = file.get("value", "")
-        pixels = self.missing.read(lambda: images.read(resolve(reference, self.path)))
+        pixels = self.companions.read(lambda: images.read(self.companions.find(reference, self.path)))
         if pixels is None:
             return None
         space = "srgb" if "srgb" in file.get("colorspace", "") else "linear"

@@ -4,25 +4,28 @@ from __future__ import annotations
 
 import shlex
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from appearance_opt.asset import images
-from appearance_opt.asset.missing import Missing, MissingTextures
 from appearance_opt.asset.packing import pack_orm
-from appearance_opt.asset.paths import read_bytes, replacing, resolve
+from appearance_opt.asset.paths import read_bytes, replacing
 from appearance_opt.asset.polygons import Polygons, triangulate
 from appearance_opt.asset.types import Asset, Material, Mesh, Texture
-from appearance_opt.errors import InputError
+from appearance_opt.errors import InputError, MissingFileError
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from appearance_opt.asset.companions import Companions
+
 _MAP_OPTIONS = {
     "-blendu": 1, "-blendv": 1, "-boost": 1, "-mm": 2, "-o": 3, "-s": 3, "-t": 3, "-texres": 1,
     "-clamp": 1, "-bm": 1, "-imfchan": 1, "-type": 1, "-cc": 1,
+    "-colorspace": 1,
 }  # fmt: skip
 """Options of map statements and how many values follow them."""
 
@@ -30,11 +33,11 @@ MAX_INDEX = 2**31 - 1
 """Largest index of a face's corner (they are kept in 32 bits)."""
 
 
-def load_obj(path: Path, missing_textures: MissingTextures = "error") -> Asset:
+def load_obj(path: Path, companions: Companions) -> Asset:
     """Read an OBJ file and its materials. Raises InputError."""
     path = Path(path)
     text = read_bytes(path).decode("utf-8", errors="replace").replace("\\\n", " ")
-    parser = _Parser(path, missing_textures)
+    parser = _Parser(path, companions)
     for number, line in enumerate(text.splitlines(), 1):
         try:
             parser.line(line)
@@ -44,7 +47,7 @@ def load_obj(path: Path, missing_textures: MissingTextures = "error") -> Asset:
 
 
 class _Parser:
-    def __init__(self, path: Path, missing_textures: MissingTextures) -> None:
+    def __init__(self, path: Path, companions: Companions) -> None:
         self.path = path
         self.positions: list[list[float]] = []
         self.uvs: list[list[float]] = []
@@ -53,8 +56,7 @@ class _Parser:
         self.polygons: dict[tuple[str, bool, bool], list[list[tuple[int, int, int]]]] = {}
         self.current = ""
         self.materials: dict[str, Material] = {}
-        self.notes: list[str] = []
-        self.missing = Missing(missing_textures, self.notes)
+        self.companions = companions
 
     def line(self, line: str) -> None:
         words = line.split()
@@ -77,9 +79,23 @@ class _Parser:
             self.current = line[line.index(key) + len(key) :].strip()
         elif key == "mtllib":
             name = line.split(None, 1)[1].strip()
-            path = self.missing.read(lambda: resolve(name, self.path), "default materials stand for its own")
-            if path is not None:
-                self.materials.update(load_mtl(path, self.notes, self.missing))
+            for path in self._libraries(name):
+                self.materials.update(load_mtl(path, self.companions))
+
+    def _libraries(self, names: str) -> list[Path]:
+        """Files of one name, which may have spaces, or of several with spaces between them."""
+        several = names.split()
+        if len(several) > 1:
+            try:
+                return [self.companions.find(names, self.path)]
+            except MissingFileError:
+                pass
+        out = []
+        for name in several:
+            find = partial(self.companions.find, name, self.path)
+            path = self.companions.read(find, "default materials stand for its own")
+            out += [] if path is None else [path]
+        return out
 
     def _corner(self, word: str) -> tuple[int, int, int]:
         parts = word.split("/")
@@ -96,14 +112,23 @@ class _Parser:
         return (out[0], out[1], out[2])
 
     def asset(self) -> Asset:
+        there = bool(self.uvs), bool(self.normals)
+        for k, what in enumerate(("texture coordinates", "normals")):
+            if not there[k] and any(key[1 + k] for key in self.polygons):
+                self.companions.note(f"faces refer to {what}, of which there are none: ignored")
         for name in dict.fromkeys(key[0] for key in self.polygons):
             if name and name not in self.materials:
-                self.notes.append(f"material '{name}' is not defined: default material used")
-        meshes = [self._mesh(*key, p) for key, p in self.polygons.items()]
-        return Asset(tuple(meshes), self.path.stem, tuple(self.notes))
+                self.companions.note(f"material '{name}' is not defined: default material used")
+        meshes = [
+            self._mesh(name, has_uv and there[0], has_normal and there[1], polygons)
+            for (name, has_uv, has_normal), polygons in self.polygons.items()
+        ]
+        return Asset(tuple(meshes), self.path.stem, tuple(self.companions.notes))
 
     def _mesh(self, name: str, has_uv: bool, has_normal: bool, polygons: list[list[tuple[int, int, int]]]) -> Mesh:
-        used, index = np.unique(np.array([c for p in polygons for c in p], np.int64), axis=0, return_inverse=True)
+        indices = np.array([c for p in polygons for c in p], np.int64)
+        indices[:, [k for k, has in ((1, has_uv), (2, has_normal)) if not has]] = -1
+        used, index = np.unique(indices, axis=0, return_inverse=True)
         for k, (what, rows) in enumerate((("position", self.positions), ("uv", self.uvs), ("normal", self.normals))):
             if used[:, k].max() >= len(rows) and used[:, k].max() >= 0:
                 raise InputError(
@@ -133,7 +158,7 @@ class _Parser:
         )
 
 
-def load_mtl(path: Path, notes: list[str], missing: Missing) -> dict[str, Material]:
+def load_mtl(path: Path, companions: Companions) -> dict[str, Material]:
     """Materials of an MTL file by name. Phong exponents become roughness sqrt(2 / (Ns + 2))."""
     out: dict[str, Material] = {}
     statements: dict[str, dict[str, str]] = {}
@@ -148,19 +173,19 @@ def load_mtl(path: Path, notes: list[str], missing: Missing) -> dict[str, Materi
             current[words[0].lower()] = words[1].strip()
     for name, values in statements.items():
         try:
-            out[name] = _material(name, values, path, notes, missing)
+            out[name] = _material(name, values, path, companions)
         except (ValueError, IndexError):
             raise InputError(f"{path}: a value of material '{name}' is missing or not a number") from None
     return out
 
 
-def _material(name: str, values: dict[str, str], path: Path, notes: list[str], missing: Missing) -> Material:
+def _material(name: str, values: dict[str, str], path: Path, companions: Companions) -> Material:
     def numbers(key: str, default: list[float]) -> list[float]:
         return [float(w) for w in values[key].split()[:3]] if key in values else default
 
     def texture(*keys: str, space: str = "linear") -> Texture | None:
         key = next((k for k in keys if k in values), None)
-        return None if key is None else missing.read(lambda: _texture(values[key], path, space))
+        return None if key is None else companions.read(lambda: _texture(values[key], path, space, companions))
 
     color = numbers("kd", [0.8, 0.8, 0.8])
     color = color * 3 if len(color) == 1 else color
@@ -169,7 +194,7 @@ def _material(name: str, values: dict[str, str], path: Path, notes: list[str], m
     roughness = numbers("pr", [float(np.sqrt(2 / (max(shininess, 0.0) + 2)))])[0]
     rough_map, metal_map = texture("map_pr"), texture("map_pm")
     if values.get("d", "1").split()[-1] not in ("1", "1.0", "1.000000") or "map_d" in values:
-        notes.append(f"material '{name}': transparency ignored, drawn opaque")
+        companions.note(f"material '{name}': transparency ignored, drawn opaque")
     orm = None if rough_map is None and metal_map is None else pack_orm(rough_map, metal_map)
     glow_map = texture("map_ke", space="srgb")
     # without the map that says where it glows, nothing does
@@ -187,7 +212,7 @@ def _material(name: str, values: dict[str, str], path: Path, notes: list[str], m
     )
 
 
-def _texture(statement: str, owner: Path, space: str) -> Texture:
+def _texture(statement: str, owner: Path, space: str, companions: Companions) -> Texture:
     words = shlex.split(statement, posix=True) if '"' in statement else statement.split()
     wrap = "repeat"
     k = 0
@@ -195,7 +220,7 @@ def _texture(statement: str, owner: Path, space: str) -> Texture:
         if words[k] == "-clamp" and words[k + 1] == "on":
             wrap = "clamp"
         k += 1 + _MAP_OPTIONS[words[k]]
-    pixels = images.read(resolve(" ".join(words[k:]), owner))
+    pixels = images.read(companions.find(" ".join(words[k:]), owner))
     if pixels.shape[2] < 3:
         pixels = np.repeat(pixels[..., :1], 3, axis=2)
     return Texture(pixels, space, (wrap, wrap))  # type: ignore[arg-type]

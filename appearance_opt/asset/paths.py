@@ -15,23 +15,32 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
 
-def resolve(reference: str, owner: Path, percent_encoded: bool = False) -> Path:
-    """Path of a file that ``owner`` refers to. Raises InputError when it lies outside owner's folder (an
-    asset must not read what it does not own), MissingFileError when it does not exist."""
+def resolve(reference: str, owner: Path, percent_encoded: bool = False, root: Path | None = None) -> Path:
+    """Path of a file that ``owner`` refers to. Raises InputError when it lies neither in owner's folder nor in ``root``
+    (an asset must not read what it does not own), MissingFileError when it does not exist."""
     text = unquote(reference) if percent_encoded else reference
     if "\0" in text or (urlparse(text).scheme and len(urlparse(text).scheme) > 1):
         raise InputError(f"{owner}: refers to '{reference}', which is not a file beside it")
-    root = owner.resolve().parent
+    folder = owner.resolve().parent
     try:
-        path = (root / text.replace("\\", "/")).resolve()
+        path = (folder / text.replace("\\", "/")).resolve()
         exists = path.is_file()
     except (OSError, ValueError, RuntimeError):  # names too long for the file system, loops of links
         raise InputError(f"{owner}: refers to '{reference[:80]}', which is no file name") from None
-    if not path.is_relative_to(root):
-        raise InputError(f"{owner}: refers to '{reference}' outside its own folder; copy the file beside it")
+    check_inside(path, owner, reference, root)
     if not exists:
         raise MissingFileError(f"{owner}: refers to '{reference}', which does not exist")
     return path
+
+
+def check_inside(path: Path, owner: Path, reference: str, root: Path | None = None) -> None:
+    """Raise InputError if ``path``, which ``owner`` calls ``reference``, lies neither in its folder nor in ``root``."""
+    allowed = [owner.resolve().parent, *([] if root is None else [root.resolve()])]
+    if not any(path.resolve().is_relative_to(folder) for folder in allowed):
+        raise InputError(
+            f"{owner}: refers to '{reference}' outside its own folder; copy it beside the file, or allow the folder "
+            "with --root"
+        )
 
 
 def read_bytes(path: Path) -> bytes:

@@ -10,7 +10,6 @@ import numpy as np
 from appearance_opt.asset import images, uv_frames
 from appearance_opt.asset.materialx import load_materialx
 from appearance_opt.asset.packing import pack_orm
-from appearance_opt.asset.paths import resolve
 from appearance_opt.asset.types import Material, Mesh, Texture
 from appearance_opt.errors import MissingFileError
 
@@ -19,7 +18,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from appearance_opt.asset.missing import Missing
+    from appearance_opt.asset.companions import Companions
 
 _WRAPS = {"repeat": "repeat", "clamp": "clamp", "mirror": "mirror", "black": "clamp"}
 _CHANNEL = {"r": 0, "g": 1, "b": 2, "a": 3}
@@ -28,8 +27,8 @@ _CHANNEL = {"r": 0, "g": 1, "b": 2, "a": 3}
 class MaterialReader:
     """Materials of a stage, each read once."""
 
-    def __init__(self, stage: Any, path: Path, missing: Missing) -> None:
-        self.stage, self.path, self.missing, self.notes = stage, path, missing, missing.notes
+    def __init__(self, stage: Any, path: Path, companions: Companions) -> None:
+        self.stage, self.path, self.companions, self.note = stage, path, companions, companions.note
         self._materials: dict[str, Material] = {}
         self.frames: dict[int, dict[str, NDArray[np.float64]]] = {}
         self._pixels: dict[str, NDArray] = {}
@@ -103,17 +102,16 @@ class MaterialReader:
 
     def _from_materialx(self, name: str) -> Material:
         """A material that usd-core could not compose because it lives in a MaterialX file."""
-        root = self.path.resolve().parent
         for layer in self.stage.GetUsedLayers():
             for dependency in layer.GetCompositionAssetDependencies():
                 if not dependency.endswith(".mtlx") or not layer.realPath:
                     continue
-                file = resolve(str((Path(layer.realPath).resolve().parent / dependency).relative_to(root)), self.path)
-                found = load_materialx(file, name, self.missing)
+                file = self.companions.find(str(Path(layer.realPath).resolve().parent / dependency), self.path)
+                found = load_materialx(file, name, self.companions)
                 if found is not None:
-                    self.notes.append(f"material '{name}' read from {file.name}: subsurface and coat ignored")
+                    self.note(f"material '{name}' read from {file.name}: subsurface and coat ignored")
                     return found
-        self.notes.append(f"material '{name}' does not exist: default material used")
+        self.note(f"material '{name}' does not exist: default material used")
         return Material(name=name)
 
     def _read(self, material: Any) -> Material:
@@ -122,7 +120,7 @@ class MaterialReader:
         name = str(material.GetPrim().GetName())
         shader = material.ComputeSurfaceSource()[0]
         if not shader or str(shader.GetIdAttr().Get()) != "UsdPreviewSurface":
-            self.notes.append(f"material '{name}' has no UsdPreviewSurface: default material used")
+            self.note(f"material '{name}' has no UsdPreviewSurface: default material used")
             return Material(name=name)
 
         def of(key: str, default: Any) -> tuple[Any, Any, str]:
@@ -146,7 +144,7 @@ class MaterialReader:
         _, normal_map, _ = of("normal", None)
         opacity, _, _ = of("opacity", 1.0)
         if float(opacity) < 1:
-            self.notes.append(f"material '{name}': transparency ignored, drawn opaque")
+            self.note(f"material '{name}': transparency ignored, drawn opaque")
         glow, glow_map, _ = of("emissiveColor", (0.0, 0.0, 0.0))
         base, base_factor = self._scaled(color_map, "srgb", "rgb", _rgb(color))
         rough, rough_factor = self._scaled(rough_map, "linear", rough_channel, (float(roughness),) * 3)
@@ -178,11 +176,7 @@ class MaterialReader:
 
     def in_one_frame(self, meshes: list[Mesh]) -> list[Mesh]:
         """Texture transforms applied, and textures brought under one transform and wrap mode where they differ."""
-        return uv_frames.unified(meshes, self.frames, self._note)
-
-    def _note(self, text: str) -> None:
-        if text not in self.notes:
-            self.notes.append(text)
+        return uv_frames.unified(meshes, self.frames, self.note)
 
     def _scaled(
         self, node: Any, space: str, channel: str, constant: tuple[float, float, float]
@@ -219,7 +213,9 @@ class MaterialReader:
     def _texture(self, node: Any, space: str, channel: str = "rgb") -> Texture | None:
         asset = _value(node.GetInput("file"))
         text = asset.resolvedPath or asset.path if asset is not None else ""
-        pixels = self.missing.read(lambda: self._image(text))
+        if not text:  # a slot for a texture, without one
+            return None
+        pixels = self.companions.read(lambda: self._image(text))
         if pixels is None:
             return None
         encoding = str(_value(node.GetInput("sourceColorSpace")) or "auto")
@@ -244,11 +240,7 @@ class MaterialReader:
                     raise MissingFileError(f"{self.path}: refers to '{text}', which does not exist")
                 self._pixels[text] = images.decode(bytes(opened.GetBuffer()), text)
             else:
-                root = self.path.resolve().parent
-                path = Path(text)
-                inside = path.is_absolute() and path.resolve().is_relative_to(root)
-                reference = str(path.resolve().relative_to(root)) if inside else text
-                self._pixels[text] = images.read(resolve(reference, self.path))
+                self._pixels[text] = images.read(self.companions.find(text, self.path))
         return self._pixels[text]
 
 

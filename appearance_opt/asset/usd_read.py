@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from appearance_opt.asset import usd_shapes
-from appearance_opt.asset.missing import Missing, MissingTextures
-from appearance_opt.asset.paths import read_bytes
+from appearance_opt.asset.companions import Companions
+from appearance_opt.asset.paths import check_inside, read_bytes
 from appearance_opt.asset.polygons import Polygons, triangulate
 from appearance_opt.asset.subdivide import Sharpness, catmull_clark
 from appearance_opt.asset.types import Asset, Mesh
@@ -35,7 +35,7 @@ def load_usd(
     path: Path,
     refine: int = 1,
     variants: dict[str, str] | None = None,
-    missing_textures: MissingTextures = "error",
+    companions: Companions | None = None,
 ) -> Asset:
     """Read a stage at its earliest time, variants at their selection (or as ``variants`` says: set name ->
     variant, on the default prim). Catmull-Clark and Loop meshes are refined ``refine`` times. Raises
@@ -47,7 +47,7 @@ def load_usd(
     # USD prints what it warns of; here it becomes notes
     diagnostics = UsdUtils.CoalescingDiagnosticDelegate()
     try:
-        asset = _read_stage(path, refine, variants or {}, missing_textures)
+        asset = _read_stage(path, refine, variants or {}, companions or Companions())
     except Tf.ErrorException as error:
         raise InputError(f"{path}: not a readable USD file ({_text(error.__str__)})") from None
     except (KeyError, IndexError, TypeError, ValueError, RuntimeError, OverflowError) as error:
@@ -57,15 +57,15 @@ def load_usd(
     return replace(asset, notes=asset.notes + tuple(f"USD: {text}" for text in dict.fromkeys(warned)))
 
 
-def _read_stage(path: Path, refine: int, variants: dict[str, str], missing_textures: MissingTextures) -> Asset:
+def _read_stage(path: Path, refine: int, variants: dict[str, str], companions: Companions) -> Asset:
     from pxr import Usd
 
     stage = Usd.Stage.Open(str(path))
     if stage is None:
         raise InputError(f"{path}: not a readable USD file")
     _select(stage, variants, path)
-    _refuse_escapes(stage, path)
-    return _Reader(stage, path, refine, missing_textures).asset()
+    _refuse_escapes(stage, path, companions)
+    return _Reader(stage, path, refine, companions).asset()
 
 
 def _select(stage: Any, variants: dict[str, str], path: Path) -> None:
@@ -79,15 +79,12 @@ def _select(stage: Any, variants: dict[str, str], path: Path) -> None:
         sets.GetVariantSet(name).SetVariantSelection(choice)
 
 
-def _refuse_escapes(stage: Any, path: Path) -> None:
-    """Layers outside the folder of the root layer are not read on behalf of it."""
-    root = path.resolve().parent
+def _refuse_escapes(stage: Any, path: Path, companions: Companions) -> None:
+    """Layers outside the folder of the root layer, or the one that is allowed, are not read on behalf of it."""
     for layer in stage.GetUsedLayers():
         if layer.anonymous or not layer.realPath:
             continue
-        real = layer.realPath.split("[")[0]
-        if not Path(real).resolve().is_relative_to(root):
-            raise InputError(f"{path}: refers to '{layer.identifier}' outside its own folder; copy it beside the file")
+        check_inside(Path(layer.realPath.split("[")[0]), path, layer.identifier, companions.root)
 
 
 def _metres_per_unit(stage: Any) -> float:
@@ -109,15 +106,15 @@ class _Geometry:
 
 
 class _Reader:
-    def __init__(self, stage: Any, path: Path, refine: int, missing_textures: MissingTextures) -> None:
+    def __init__(self, stage: Any, path: Path, refine: int, companions: Companions) -> None:
         from pxr import Usd, UsdGeom
 
         self.stage, self.path, self.refine = stage, path, refine
-        self.notes: list[str] = []
+        self.companions, self.note = companions, companions.note
         self.up = str(UsdGeom.GetStageUpAxis(stage))
         self.unit = _metres_per_unit(stage)
         self.to_metres = _TO_Y_UP[self.up] * self.unit
-        self.materials = MaterialReader(stage, path, Missing(missing_textures, self.notes))
+        self.materials = MaterialReader(stage, path, companions)
         # the first frame of what is animated
         self.time = Usd.TimeCode.EarliestTime()
         self.cache = UsdGeom.XformCache(self.time)
@@ -136,7 +133,7 @@ class _Reader:
                 if geometry is not None:
                     meshes += self._split(prim, geometry, self.cache.GetLocalToWorldTransform(prim))
         meshes = self.materials.in_one_frame(meshes)
-        return Asset(tuple(meshes), self.path.stem, tuple(self.notes), self.up, self.unit)  # type: ignore[arg-type]
+        return Asset(tuple(meshes), self.path.stem, tuple(self.companions.notes), self.up, self.unit)  # type: ignore[arg-type]
 
     def _shown(self, prim: Any) -> bool:
         from pxr import UsdGeom
@@ -144,7 +141,7 @@ class _Reader:
         imageable = UsdGeom.Imageable(prim)
         hidden = imageable.ComputeVisibility(self.time) == UsdGeom.Tokens.invisible
         if hidden or imageable.ComputePurpose() in (UsdGeom.Tokens.guide, UsdGeom.Tokens.proxy):
-            self._note(f"'{prim.GetPath()}' ignored: hidden, guide or proxy geometry")
+            self.note(f"'{prim.GetPath()}' ignored: hidden, guide or proxy geometry")
             return False
         return True
 
@@ -164,12 +161,12 @@ class _Reader:
         for k, target in enumerate(instancer.GetPrototypesRel().GetForwardedTargets()):
             root = self.stage.GetPrimAtPath(target)
             if not root:
-                self._note(f"'{prim.GetPath()}': its prototype '{target}' does not exist")
+                self.note(f"'{prim.GetPath()}': its prototype '{target}' does not exist")
                 continue
             back = self.cache.GetLocalToWorldTransform(root).GetInverse()
             for part in Usd.PrimRange(root, Usd.TraverseInstanceProxies()):
                 if part.IsA(UsdGeom.PointInstancer):
-                    self._note(f"'{part.GetPath()}' ignored: it is a prototype of another PointInstancer")
+                    self.note(f"'{part.GetPath()}' ignored: it is a prototype of another PointInstancer")
                 geometry = self._geometry(part) if part.IsA(UsdGeom.Gprim) and self._shown(part) else None
                 if geometry is None:
                     continue
@@ -177,10 +174,6 @@ class _Reader:
                 for i in np.flatnonzero(number == k):
                     meshes += self._split(part, geometry, local * transforms[int(i)] * world)
         return meshes
-
-    def _note(self, text: str) -> None:
-        if text not in self.notes:
-            self.notes.append(text)
 
     def _geometry(self, prim: Any) -> _Geometry | None:
         """A mesh or a shape in its own frame; None, with a note, if it is something else."""
@@ -191,7 +184,7 @@ class _Reader:
             return _Geometry(*self._mesh(prim), flipped)
         found = usd_shapes.triangles(prim, self.time)
         if found is None:
-            self._note(f"{prim.GetTypeName()} '{prim.GetPath()}' ignored: only surfaces are read")
+            self.note(f"{prim.GetTypeName()} '{prim.GetPath()}' ignored: only surfaces are read")
             return None
         positions, normals, faces = found
         polygons = Polygons(np.full(len(faces), 3), faces.ravel())
@@ -219,7 +212,7 @@ class _Reader:
         if scheme in ("catmullClark", "loop") and self.refine > 0:
             values.pop("normals", None)
             if scheme == "loop":
-                self._note("Loop subdivision surfaces are refined by the rules of Catmull-Clark")
+                self.note("Loop subdivision surfaces are refined by the rules of Catmull-Clark")
             sharpness = {"points": self._sharpness(mesh, len(points))}
             for _ in range(self.refine):
                 face_ids = np.repeat(face_ids, values["points"][1].counts)
@@ -330,7 +323,10 @@ class _Reader:
 def _expand(value: Any, how: str, polygons: Polygons, width: int) -> tuple[NDArray, Polygons] | None:
     """A primvar as (values (N, width), faces into them); None when its size does not fit its
     interpolation."""
-    v = np.array(value, np.float64).reshape(-1, width)
+    v = np.array(value, np.float64)
+    if v.size % width:
+        return None
+    v = v.reshape(-1, width)
     corners = len(polygons.indices)
     if how in ("vertex", "varying") and len(v) > polygons.indices.max(initial=-1):
         return v, polygons

@@ -13,7 +13,7 @@ from appearance_opt import backend
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from appearance_opt.asset.missing import MissingTextures
+    from appearance_opt.asset.companions import MissingTextures
     from appearance_opt.asset.types import Asset
     from appearance_opt.evaluate.metrics import Metrics
     from appearance_opt.views import Views, ViewSampler
@@ -44,14 +44,18 @@ def compare(
     device: str = "auto",
     out: str | Path | None = None,
     missing_textures: MissingTextures = "error",
+    root: str | Path | None = None,
 ) -> Comparison:
     """Render both assets from ``views`` random cameras under random lights and measure the difference.
-    ``out``: folder for a report with pictures. ``missing_textures``: see ``load``. Raises AppearanceError."""
+    ``out``: folder for a report with pictures. ``missing_textures``, ``root``: see ``load``. Raises
+    AppearanceError."""
     from appearance_opt.asset import load
     from appearance_opt.asset.types import Asset
 
-    first = reference if isinstance(reference, Asset) else load(reference, missing_textures=missing_textures)
-    second = candidate if isinstance(candidate, Asset) else load(candidate, missing_textures=missing_textures)
+    first, second = (
+        a if isinstance(a, Asset) else load(a, missing_textures=missing_textures, root=root)
+        for a in (reference, candidate)
+    )
     backend.select(device)
     from appearance_opt.jobs.simplify import in_frame, support
     from appearance_opt.views import ViewSampler, framing

@@ -113,7 +113,8 @@ def loaded(source: str | Path | Asset, options: CommonOptions, variants: dict[st
     """``source`` itself, or the file of that name, read as the options say."""
     if not isinstance(source, (str, Path)):
         return source
-    return load(source, refine=options.refine, variants=variants, missing_textures=options.missing_textures)
+    given = {"missing_textures": options.missing_textures, "root": options.root}
+    return load(source, refine=options.refine, variants=variants, **given)  # type: ignore[arg-type]
 
 
 def check_paths(
