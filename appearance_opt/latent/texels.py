@@ -1,7 +1,8 @@
 """Fitted maps: packed texels, their encoding, and the mip pyramid that the renderer reads.
 
 Colours are stored as the square root of linear values, so that a step of the optimiser means about the same
-to the eye in dark and in light regions; everything else is stored as it is.
+to the eye in dark and in light regions. Normals are stored with any length, and mean unit ones, as in a file: so do the
+mip levels made of them. Everything else is stored as it is.
 """
 
 from __future__ import annotations
@@ -31,6 +32,7 @@ BOUNDS = {
     "normal_z": (0.05, 1.0),
     "displacement": (-1.0, 1.0),
 }
+NORMALS = ("normal_x", "normal_y", "normal_z")
 MAX_LEVELS = 7
 """Levels of a fitted pyramid: no view minifies an atlas by more than 2^6."""
 
@@ -44,6 +46,7 @@ class TexelCodec:
         self.packed = 1 << (len(channels) - 1).bit_length()
         self.layout = pyramid_layout([(size, size)], self.packed, [CLAMP], MAX_LEVELS)
         self._template = Pyramid.of(self.layout, mi.Float(0))
+        self._normal = [channels.index(name) for name in NORMALS] if set(NORMALS) <= set(channels) else []
         self._is_color = [c in COLORS for c in channels] + [False] * (self.packed - len(channels))
 
     def encode(self, maps: Mapping[str, NDArray]) -> mi.Float:
@@ -103,11 +106,21 @@ class TexelCodec:
             if width != self.size:
                 total = _flat(list(own))
         texel = self._rows(stored)
-        return _flat([g * (2 * t) if c else g for g, t, c in zip(own, texel, self._is_color, strict=True)])
+        rows = [g * (2 * t) if c else g for g, t, c in zip(own, texel, self._is_color, strict=True)]
+        if self._normal:
+            n, g = (mi.Vector3f(*(v[k] for k in self._normal)) for v in (texel, rows))
+            # the part along the normal does nothing; rounding would leave some, of which Adam makes whole steps
+            inverse = dr.rcp(dr.squared_norm(n))
+            g = (g - n * (dr.dot(n, g) * inverse)) * dr.sqrt(inverse)
+            for k, value in zip(self._normal, g, strict=True):
+                rows[k] = value
+        return _flat(rows)
 
     def to_maps(self, stored: mi.Float) -> dict[str, NDArray[np.float32]]:
         """Natural values on the host: channel name -> (size, size)."""
         texels = np.array(stored).reshape(self.size, self.size, self.packed)
+        if self._normal:
+            texels[..., self._normal] /= np.linalg.norm(texels[..., self._normal], axis=-1, keepdims=True)
         return {n: texels[..., k] ** 2 if n in COLORS else texels[..., k] for k, n in enumerate(self.channels)}
 
     def per_channel(self, values: Mapping[str, float]) -> mi.Float:
@@ -115,8 +128,13 @@ class TexelCodec:
         return mi.Float([values[c] for c in self.channels] + [0.0] * (self.packed - len(self.channels)))
 
     def _decoded(self, rows: mi.ArrayXf) -> mi.ArrayXf:
-        """Natural (linear) values of stored texels."""
-        return mi.ArrayXf([dr.square(t) if c else t for t, c in zip(rows, self._is_color, strict=True)])
+        """Natural values of stored texels: linear colours, unit normals."""
+        out = [dr.square(t) if c else t for t, c in zip(rows, self._is_color, strict=True)]
+        if self._normal:
+            n = mi.Vector3f(*(rows[k] for k in self._normal))
+            for k, value in zip(self._normal, n * dr.rsqrt(dr.squared_norm(n)), strict=True):
+                out[k] = value
+        return mi.ArrayXf(out)
 
     def _rows(self, stored: mi.Float) -> mi.ArrayXf:
         n = self.size * self.size
