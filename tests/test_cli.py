@@ -76,6 +76,17 @@ def test_inspect_counts_what_is_wrong(tmp_path: Path) -> None:
     assert any("1 degenerate" in n for n in found["notes"])
 
 
+def test_a_root_is_passed_on(ball: Asset, tmp_path: Path) -> None:
+    for name in ("library", "shot"):
+        (tmp_path / name).mkdir()
+    save(ball, tmp_path / "library" / "ball.usda")
+    (tmp_path / "shot" / "scene.usda").write_text("#usda 1.0\n(subLayers = [@../library/ball.usda@])\n")
+    refused = run("inspect", "shot/scene.usda", cwd=tmp_path)
+    assert refused.returncode == 2
+    assert "--root" in refused.stderr
+    assert run("inspect", "shot/scene.usda", "--root", ".", cwd=tmp_path).returncode == 0
+
+
 def test_doctor_and_version() -> None:
     done = run("doctor", "--json")
     assert done.returncode == 0
