@@ -7,6 +7,9 @@ from numpy.typing import NDArray
 
 from appearance_opt.asset.types import Texture, linear_to_srgb
 
+EMISSION = ("emission_red", "emission_green", "emission_blue")
+"""Names of the channels of emission among those of baked maps."""
+
 
 def resized(pixels: NDArray[np.float32], height: int, width: int) -> NDArray[np.float32]:
     """Bilinear enlargement of (H, W, C) pixels, texel centres at (i + 0.5) / size."""

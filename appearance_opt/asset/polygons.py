@@ -8,6 +8,8 @@ import mapbox_earcut
 import numpy as np
 from numpy.typing import NDArray
 
+from appearance_opt.asset.normals import accumulate
+
 
 @dataclass(frozen=True)
 class Polygons:
@@ -36,10 +38,12 @@ def triangulate(polygons: Polygons, points: NDArray) -> tuple[NDArray[np.int64],
     k = np.arange(len(face)) - np.repeat(np.cumsum(fans) - fans, fans)
     first = start[face]
     triangles = np.stack([first, first + k + 1, first + k + 2], axis=1)
+    if polygons.counts.max(initial=0) <= 3:  # no fan of one triangle leaves it
+        return triangles, face
     p = np.asarray(points, np.float64)[polygons.indices[triangles]]
     normals = np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0])
     total = np.zeros((len(fans), 3))
-    np.add.at(total, face, normals)
+    accumulate(total, face, normals)
     leaves = np.zeros(len(fans), bool)
     leaves[face[np.sum(normals * total[face], axis=1) < 0]] = True
     if not leaves.any():

@@ -98,73 +98,100 @@ def _mesh(stage: Any, target: str, mesh: Mesh, material: Any) -> None:
 
 
 def _material(stage: Any, target: str, m: Material, folder: Path) -> Any:
-    from pxr import Gf, Sdf, UsdShade
+    from pxr import UsdShade
 
-    types = Sdf.ValueTypeNames
     material = UsdShade.Material.Define(stage, target)
-    shader = UsdShade.Shader.Define(stage, f"{target}/Surface")
-    shader.CreateIdAttr("UsdPreviewSurface")
-    material.CreateSurfaceOutput().ConnectToSource(shader.ConnectableAPI(), "surface")
-    reader = UsdShade.Shader.Define(stage, f"{target}/st")
-    reader.CreateIdAttr("UsdPrimvarReader_float2")
-    reader.CreateInput("varname", types.String).Set("st")
-    stem = target.rsplit("/", 1)[1]
-
-    def sampler(key: str, texture: Texture, space: str, data: bytes | None = None) -> Any:
-        file = folder / f"{stem}_{key}.png"
-        folder.mkdir(exist_ok=True)
-        file.write_bytes(images.encode_png(_stored(texture)) if data is None else data)
-        node = UsdShade.Shader.Define(stage, f"{target}/{key}")
-        node.CreateIdAttr("UsdUVTexture")
-        node.CreateInput("file", types.Asset).Set(Sdf.AssetPath(f"./{folder.name}/{file.name}"))
-        node.CreateInput("sourceColorSpace", types.Token).Set(space)
-        node.CreateInput("st", types.Float2).ConnectToSource(reader.ConnectableAPI(), "result")
-        for axis, wrap in zip("ST", texture.wrap, strict=True):
-            node.CreateInput(f"wrap{axis}", types.Token).Set(wrap)
-        return node
-
-    color = shader.CreateInput("diffuseColor", types.Color3f)
-    if m.base_color_texture is not None:
-        node = sampler("base_color", m.base_color_texture, "sRGB")
-        if tuple(m.base_color) != (1.0, 1.0, 1.0):
-            node.CreateInput("scale", types.Float4).Set(Gf.Vec4f(*m.base_color, 1.0))
-        color.ConnectToSource(node.ConnectableAPI(), "rgb")
-    else:
-        color.Set(Gf.Vec3f(*m.base_color))
+    preview = _Preview(stage, target, folder)
+    material.CreateSurfaceOutput().ConnectToSource(preview.shader.ConnectableAPI(), "surface")
+    preview.color("diffuseColor", "base_color", m.base_color, m.base_color_texture)
     if m.emits:
-        glow = shader.CreateInput("emissiveColor", types.Color3f)
-        if m.emission_texture is None:
-            glow.Set(Gf.Vec3f(*m.emission))
-        else:
-            node = sampler("emission", m.emission_texture, "sRGB")
-            node.CreateInput("scale", types.Float4).Set(Gf.Vec4f(*m.emission, 1.0))
-            glow.ConnectToSource(node.ConnectableAPI(), "rgb")
-    roughness, metallic = (shader.CreateInput(k, types.Float) for k in ("roughness", "metallic"))
-    if m.orm_texture is not None:
-        node = sampler("orm", m.orm_texture, "raw")
-        if (m.roughness, m.metalness) != (1.0, 1.0):
-            node.CreateInput("scale", types.Float4).Set(Gf.Vec4f(1.0, m.roughness, m.metalness, 1.0))
-        roughness.ConnectToSource(node.ConnectableAPI(), "g")
-        metallic.ConnectToSource(node.ConnectableAPI(), "b")
-        if m.has_occlusion:
-            shader.CreateInput("occlusion", types.Float).ConnectToSource(node.ConnectableAPI(), "r")
-    else:
-        roughness.Set(m.roughness)
-        metallic.Set(m.metalness)
+        preview.color("emissiveColor", "emission", m.emission, m.emission_texture)
+    preview.roughness_and_metalness(m)
     if m.normal_texture is not None:
-        node = sampler("normal", m.normal_texture, "raw")
-        node.CreateInput("scale", types.Float4).Set(Gf.Vec4f(2 * m.normal_scale, 2 * m.normal_scale, 2, 1))
-        node.CreateInput("bias", types.Float4).Set(Gf.Vec4f(-m.normal_scale, -m.normal_scale, -1, 0))
-        shader.CreateInput("normal", types.Normal3f).ConnectToSource(node.ConnectableAPI(), "rgb")
+        s = m.normal_scale
+        node = preview.sampler("normal", m.normal_texture, "raw", (2 * s, 2 * s, 2, 1), (-s, -s, -1, 0))
+        preview.connect("normal", "Normal3f", node, "rgb")
     if m.displacement is not None:
         d = as_16_bit(m.displacement)
-        scale, mid = d.scale, d.mid
-        node = sampler("displacement", d.texture, "raw", height_png(d))
-        node.CreateInput("scale", types.Float4).Set(Gf.Vec4f(scale, scale, scale, 1))
-        node.CreateInput("bias", types.Float4).Set(Gf.Vec4f(-mid * scale, -mid * scale, -mid * scale, 0))
-        shader.CreateInput("displacement", types.Float).ConnectToSource(node.ConnectableAPI(), "r")
-        material.CreateDisplacementOutput().ConnectToSource(shader.ConnectableAPI(), "displacement")
+        scale, bias = (d.scale,) * 3 + (1,), (-d.mid * d.scale,) * 3 + (0,)
+        node = preview.sampler("displacement", d.texture, "raw", scale, bias, height_png(d))
+        preview.connect("displacement", "Float", node, "r")
+        material.CreateDisplacementOutput().ConnectToSource(preview.shader.ConnectableAPI(), "displacement")
     return material
+
+
+class _Preview:
+    """A UsdPreviewSurface and the samplers of its textures, which are written to ``folder``."""
+
+    def __init__(self, stage: Any, target: str, folder: Path) -> None:
+        from pxr import Sdf
+
+        self.stage, self.target, self.folder = stage, target, folder
+        self.types = Sdf.ValueTypeNames
+        self.shader = self._node("Surface", "UsdPreviewSurface")
+        self.reader = self._node("st", "UsdPrimvarReader_float2")
+        self.reader.CreateInput("varname", self.types.String).Set("st")
+
+    def _node(self, name: str, kind: str) -> Any:
+        from pxr import UsdShade
+
+        node = UsdShade.Shader.Define(self.stage, f"{self.target}/{name}")
+        node.CreateIdAttr(kind)
+        return node
+
+    def sampler(
+        self,
+        key: str,
+        texture: Texture,
+        space: str,
+        scale: tuple[float, ...] | None = None,
+        bias: tuple[float, ...] | None = None,
+        data: bytes | None = None,
+    ) -> Any:
+        """A node that reads ``texture``, written as ``data`` if that is given."""
+        from pxr import Gf, Sdf
+
+        file = self.folder / f"{self.target.rsplit('/', 1)[1]}_{key}.png"
+        self.folder.mkdir(exist_ok=True)
+        file.write_bytes(images.encode_png(_stored(texture)) if data is None else data)
+        node = self._node(key, "UsdUVTexture")
+        node.CreateInput("file", self.types.Asset).Set(Sdf.AssetPath(f"./{self.folder.name}/{file.name}"))
+        node.CreateInput("sourceColorSpace", self.types.Token).Set(space)
+        node.CreateInput("st", self.types.Float2).ConnectToSource(self.reader.ConnectableAPI(), "result")
+        for axis, wrap in zip("ST", texture.wrap, strict=True):
+            node.CreateInput(f"wrap{axis}", self.types.Token).Set(wrap)
+        for name, value in (("scale", scale), ("bias", bias)):
+            if value is not None:
+                node.CreateInput(name, self.types.Float4).Set(Gf.Vec4f(*value))
+        return node
+
+    def connect(self, name: str, kind: str, node: Any, output: str) -> None:
+        """Let an input of the surface follow an output of a sampler."""
+        source = self.shader.CreateInput(name, getattr(self.types, kind))
+        source.ConnectToSource(node.ConnectableAPI(), output)
+
+    def color(self, name: str, key: str, factor: tuple[float, float, float], texture: Texture | None) -> None:
+        """A colour: a constant, or a texture times a factor."""
+        from pxr import Gf
+
+        if texture is None:
+            self.shader.CreateInput(name, self.types.Color3f).Set(Gf.Vec3f(*factor))
+            return
+        scale = None if tuple(factor) == (1.0, 1.0, 1.0) else (*factor, 1.0)
+        self.connect(name, "Color3f", self.sampler(key, texture, "sRGB", scale), "rgb")
+
+    def roughness_and_metalness(self, m: Material) -> None:
+        """Both, and occlusion, from one texture, or constants."""
+        if m.orm_texture is None:
+            self.shader.CreateInput("roughness", self.types.Float).Set(m.roughness)
+            self.shader.CreateInput("metallic", self.types.Float).Set(m.metalness)
+            return
+        plain = (m.roughness, m.metalness) == (1.0, 1.0)
+        node = self.sampler("orm", m.orm_texture, "raw", None if plain else (1.0, m.roughness, m.metalness, 1.0))
+        self.connect("roughness", "Float", node, "g")
+        self.connect("metallic", "Float", node, "b")
+        if m.has_occlusion:
+            self.connect("occlusion", "Float", node, "r")
 
 
 def _stored(texture: Texture) -> NDArray:

@@ -13,12 +13,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from appearance_opt.asset.packing import EMISSION
 from appearance_opt.baking.curvature import mean_curvature
 from appearance_opt.baking.occlusion import exposed, openness
 from appearance_opt.baking.points import Points, TexelPoints, interpolate_packets
 from appearance_opt.baking.search import Found, Pick, automatic_reach, find
 from appearance_opt.initial.fill import fill
-from appearance_opt.reference.textures import EMISSION
 from appearance_opt.render import upload
 from appearance_opt.render.rays import sub_pixel_offsets
 from appearance_opt.render.surface import face_normal

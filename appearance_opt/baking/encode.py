@@ -10,7 +10,7 @@ import numpy as np
 
 from appearance_opt.asset import images
 from appearance_opt.asset.height import displacement_of, height_exr, height_png
-from appearance_opt.asset.packing import pack_emission
+from appearance_opt.asset.packing import EMISSION, pack_emission
 from appearance_opt.asset.types import Material, Texture, Wrap, linear_to_srgb
 
 if TYPE_CHECKING:
@@ -72,8 +72,8 @@ def material_change(maps: Mapping[str, NDArray], options: BakeOptions) -> Callab
             "normal_scale": 1.0,
             "normal_texture": Texture(quantised(normal_image(maps), options.bits), "linear", CLAMP),
         }
-    if "emission_red" in maps:
-        emission, texture = pack_emission(stacked(maps, "emission_red", "emission_green", "emission_blue"))
+    if EMISSION[0] in maps:
+        emission, texture = pack_emission(stacked(maps, *EMISSION))
         new |= {"emission": emission, "emission_texture": texture}
     if options.wants("displacement"):
         new["displacement"] = displacement_of(maps["displacement"])
@@ -147,8 +147,8 @@ def _loose_maps(maps: Mapping[str, NDArray], covered: NDArray, options: BakeOpti
         yield LooseMap("normal", pixels, facts={"space": "tangent (MikkTSpace)", "green": options.green, **unit})
     if options.wants("object-normal"):
         yield LooseMap("object-normal", normal_image(maps, "object"), facts={"space": "object, +Y up", **unit})
-    if "emission_red" in maps:
-        pixels = stacked(maps, "emission_red", "emission_green", "emission_blue")
+    if EMISSION[0] in maps:
+        pixels = stacked(maps, *EMISSION)
         yield LooseMap("emission", pixels, srgb=True)
     if options.wants("ao"):
         yield LooseMap("ao", stacked(maps, "occlusion"), facts={"encoding": "1: open, 0: occluded"})

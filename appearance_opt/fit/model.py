@@ -13,7 +13,7 @@ from appearance_opt.fit.smoothing import Smoother
 from appearance_opt.latent.displacement import DISPLACEMENT, Tessellator
 from appearance_opt.latent.latent import LatentMesh, LatentTopology, local_edge_length
 from appearance_opt.latent.parameter import Parameter
-from appearance_opt.latent.texels import BOUNDS, TexelCodec
+from appearance_opt.latent.texels import BOUNDS, NORMALS, TexelCodec
 from appearance_opt.render import upload
 from appearance_opt.render.material import CHANNELS, MaterialMaps, TexelLayer
 
@@ -24,7 +24,6 @@ if TYPE_CHECKING:
 
     from appearance_opt.render.surface import Surface
 
-NORMAL_CHANNELS = ("normal_x", "normal_y", "normal_z")
 POSITIONS, TEXELS = "positions", "texels"
 
 
@@ -42,7 +41,7 @@ class Rates:
 
     def of_channel(self, name: str) -> float:
         """Rate of a texel channel."""
-        if name in NORMAL_CHANNELS:
+        if name in NORMALS:
             return self.normal
         return self.base_color if name in ("red", "green", "blue") else self.material
 
@@ -309,6 +308,6 @@ def _tracked(layer: TexelLayer) -> TexelLayer:
 
 def _group(channel: str) -> str:
     """The part of ``fit`` that a channel belongs to."""
-    if channel in NORMAL_CHANNELS:
+    if channel in NORMALS:
         return "normal"
     return "gamma" if channel == "gamma" else "material"

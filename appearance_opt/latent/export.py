@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from appearance_opt.asset.normals import split_where_cancelled, summed_normals
-from appearance_opt.asset.packing import pack_emission
+from appearance_opt.asset.packing import EMISSION, pack_emission
 from appearance_opt.asset.tangents import split_and_tangents
 from appearance_opt.asset.types import Asset, Material, Mesh, Texture
 
@@ -66,9 +66,8 @@ def _material(maps: Mapping[str, NDArray | float], name: str, double_sided: bool
         orm = np.concatenate([np.ones((*rough_metal.shape[:2], 1), np.float32), rough_metal], axis=-1)
     if normal is not None:
         normal = normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-6)
-    glow = tuple(f"emission_{c}" for c in ("red", "green", "blue"))
-    emitted = stacked(*glow)
-    emission, emission_texture = pack_emission(emitted) if emitted is not None else (numbers(*glow), None)
+    emitted = stacked(*EMISSION)
+    emission, emission_texture = pack_emission(emitted) if emitted is not None else (numbers(*EMISSION), None)
     color = tuple(float(maps.get(c, 0.5)) if base is None else 1.0 for c in ("red", "green", "blue"))
     clamp = ("clamp", "clamp")
     return Material(

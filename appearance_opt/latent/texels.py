@@ -1,8 +1,8 @@
 """Fitted maps: packed texels, their encoding, and the mip pyramid that the renderer reads.
 
 Colours are stored as the square root of linear values, so that a step of the optimiser means about the same
-to the eye in dark and in light regions. Normals are stored with any length, and mean unit ones, as in a file: so do the
-mip levels made of them. Everything else is stored as it is.
+to the eye in dark and in light regions. Normals are stored with any length, and mean unit ones, as in a file; mip
+levels are means of those. Everything else is stored as it is.
 """
 
 from __future__ import annotations

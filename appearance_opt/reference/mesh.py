@@ -10,8 +10,9 @@ import mitsuba as mi
 import numpy as np
 
 from appearance_opt.asset.normals import split_where_cancelled, summed_normals
+from appearance_opt.asset.packing import EMISSION
 from appearance_opt.asset.tangents import any_tangent, split_and_tangents
-from appearance_opt.reference.textures import EMISSION, emission_maps, material_maps
+from appearance_opt.reference.textures import emission_maps, material_maps
 from appearance_opt.render import deferred, upload
 from appearance_opt.render.deferred import Grid
 from appearance_opt.render.freezing import Frozen
@@ -128,9 +129,7 @@ class MeshReference:
             return [mi.Float(self.emission.constants[name]) for name in EMISSION]
         with dr.suspend_grad():
             hit = interpolate_at(self.surface, triangle, b1, b2, area)
-            pyramid = self.emission.layers[0].pyramid
-            material = hit.material if len(pyramid.layout.sizes) > 1 else None
-            return pyramid.lookup(material, hit.uv, hit.footprint)[:3]
+            return self.emission.layers[0].at(hit)[:3]
 
     def frame_at(self, triangle: mi.UInt32, b1: mi.Float, b2: mi.Float) -> tuple[mi.Point3f, mi.Vector3f, mi.Vector3f]:
         """(position, normal of the triangle by its winding, interpolated vertex normal), the last turned to

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from appearance_opt.asset.packing import resized
+from appearance_opt.asset.packing import EMISSION, resized
 from appearance_opt.render.material import MaterialMaps, TexelLayer
 from appearance_opt.render.texture import CLAMP, MIRROR, REPEAT, build_pyramid
 
@@ -17,7 +17,6 @@ if TYPE_CHECKING:
 
 _WRAP = {"repeat": REPEAT, "clamp": CLAMP, "mirror": MIRROR}
 _PLAIN = ("red", "green", "blue", "roughness", "metalness")
-EMISSION = ("emission_red", "emission_green", "emission_blue")
 _FULL = (*_PLAIN, "normal_x", "normal_y", "normal_z")
 
 

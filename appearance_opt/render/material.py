@@ -41,6 +41,11 @@ class TexelLayer:
         """The same layer around other texels."""
         return TexelLayer(self.channels, self.pyramid.with_texels(texels))
 
+    def at(self, hit: Hit) -> list:
+        """Values of all channels at each hit, padding included."""
+        material = hit.material if len(self.pyramid.layout.sizes) > 1 else None
+        return self.pyramid.lookup(material, hit.uv, hit.footprint)
+
 
 @dataclass(frozen=True)
 class MaterialMaps:
@@ -59,9 +64,7 @@ def evaluate(maps: MaterialMaps, hit: Hit) -> MaterialSample:
     """Material at each hit."""
     value: dict[str, mi.Float] = {k: mi.Float(v) for k, v in {**DEFAULTS, **maps.constants}.items()}
     for layer in maps.layers:
-        material = hit.material if len(layer.pyramid.layout.sizes) > 1 else None
-        texel = layer.pyramid.lookup(material, hit.uv, hit.footprint)
-        value.update(zip(layer.channels, texel, strict=False))
+        value.update(zip(layer.channels, layer.at(hit), strict=False))
     base = mi.Color3f(value["red"], value["green"], value["blue"])
     if hit.color is not None:
         base *= hit.color
