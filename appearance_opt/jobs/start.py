@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import logging
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from appearance_opt.errors import InputError
-from appearance_opt.initial.atlas import unwrap
+from appearance_opt.initial.atlas import charted, packed, unwrap
 from appearance_opt.initial.decimate import decimate
+from appearance_opt.initial.density import chart_scales
 from appearance_opt.initial.reallocate import StartError, weights
 from appearance_opt.initial.sphere import SMALLEST as SMALLEST_SPHERE
 from appearance_opt.initial.sphere import random_maps, sphere
@@ -52,7 +53,7 @@ class Start:
     """``maps``: channel name -> image or number; ``relative``: may the Laplacian keep this shape?
     ``known``: texels whose values mean something. ``levels``: tessellation levels at which it is drawn;
     ``finest``: the displaced mesh of the finest one, None without displacement. ``grown``: was it found by fitting
-    (from a sphere)?"""
+    (from a sphere)? ``charts``: the mesh with its charts as they were before they were packed, if they were kept."""
 
     mesh: LatentMesh
     maps: dict[str, NDArray | float]
@@ -61,6 +62,7 @@ class Start:
     levels: tuple[int, ...] = (0,)
     finest: LatentMesh | None = None
     grown: bool = False
+    charts: LatentMesh | None = None
 
     @property
     def drawn(self) -> LatentMesh:
@@ -112,11 +114,11 @@ def make_start(
         positions, low = decimate(merged.positions, faces[visible], triangles, weight[visible])
         if not len(low):
             raise InputError("nothing is left of this mesh at that budget; ask for more triangles")
-        return mapped(positions, low, False)
+        return mapped(charted(positions, low), np.ones(len(low)), False)
 
-    def mapped(positions: NDArray, low: NDArray, tight: bool) -> Start:
-        mesh = unwrap(positions, low, size, gutter(len(low), options), tight)
-        return transferred(reference, mesh, options)
+    def mapped(charts: LatentMesh, scale: NDArray, tight: bool) -> Start:
+        mesh = packed(charts, scale, size, gutter(len(charts.faces), options), tight)
+        return replace(transferred(reference, mesh, options), charts=charts)
 
     began = time.perf_counter()
     start = decimated(weight)
@@ -124,12 +126,14 @@ def make_start(
     rounds = affordable(options.reallocate, taken, None if seconds is None else seconds - taken)
     if not rounds:
         return start
-    judge = StartError(reference, sampler.held_out(3))
+    views = sampler.held_out(3)
+    judge = StartError(reference, views)
     start, error = _reallocated(start, weight, visible, decimated, judge, rounds)
-    if len(start.mesh.faces) > TIGHT_TRIANGLES:
-        return start
-    packed = mapped(start.mesh.positions, start.mesh.faces, True)
-    return packed if judge.measure(packed.drawn, _images(packed))[0] < error else start
+    assert start.charts is not None
+    # displaced vertices read the rim of a chart on both of its sides, which asks for the same texels everywhere
+    scale = np.ones(len(start.mesh.faces)) if options.displaced else chart_scales(start.mesh, _images(start), views)
+    again = mapped(start.charts, scale, len(start.mesh.faces) <= TIGHT_TRIANGLES)
+    return again if judge.measure(again.drawn, _images(again))[0] < error else start
 
 
 def affordable(rounds: int, taken: float, left: float | None) -> int:

@@ -109,8 +109,8 @@ class MeshReference:
         return self._grid
 
     def render_device(self, records: mi.Float, grid: Grid, samples: int, width: float | None = None) -> mi.Float:
-        """The same for a batch whose records are on the device; the image stays there, flat. Textures are filtered
-        over ``width`` pixels (the share of a sample)."""
+        """The same for a batch whose records are on the device; the image stays there, flat. ``width``: as for
+        ``deferred.render_image``."""
         with dr.suspend_grad():
             return deferred.render_image(self.scene, self.surface, self.maps, records, grid, samples, width, self._run)
 

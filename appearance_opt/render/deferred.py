@@ -102,19 +102,22 @@ def render_image(
     run: Run = traced,
 ) -> mi.Float:
     """A whole batch of images with ``samples`` samples in every pixel, without gradients. Textures are filtered
-    over ``width`` pixels (the share of a sample). ``run``: how its stages are called (see ``freezing``).
+    over ``width`` pixels; by default over the whole pixel where it has one sample, and by the samples alone where it
+    has several: mip levels of normal maps are flatter than what they stand for, and shine in other places. ``run``: how
+    its stages are called (see ``freezing``).
 
     Returns (pixels * 4) premultiplied linear radiance and coverage. One sample of all pixels at a time,
     so that memory does not grow with ``samples``.
     """
     drawing = Drawing(surface, maps, records, grid.size, grid.rows)
-    filtered = samples**-0.5 if width is None else width
+    if width is None:
+        width = 1.0 if samples == 1 else 0.0
     image = dr.zeros(mi.Float, grid.pixels * 4)
     for dx, dy in rays.sub_pixel_offsets(samples):
         hits, _, covered = _seen(scene, drawing, grid, dx, dy, run)
         # one sample per pixel in each pass: no two threads meet
         mode = dr.ReduceMode.NoConflicts
-        image = _with_shaded(image, drawing, hits, covered, 1 / samples, filtered, mode, run)
+        image = _with_shaded(image, drawing, hits, covered, 1 / samples, width, mode, run)
     return image
 
 

@@ -19,7 +19,7 @@ from appearance_opt.jobs import growth
 from appearance_opt.jobs.compare import render_asset
 from appearance_opt.jobs.displaced import gutter
 from appearance_opt.jobs.simplify import in_frame
-from appearance_opt.jobs.start import TIGHT_TRIANGLES, Start, budget, make_start, transferred
+from appearance_opt.jobs.start import Start, budget, make_start, transferred
 from experiments import common
 from experiments.common import Framed, source_of
 
@@ -137,8 +137,7 @@ class Bench:
                 return make_start(self.reference, options, self.sampler, count), False
             mesh = self.start(first).mesh  # the same triangles in another atlas
             other = simplify_options("default", ratio=self.subject.ratio, steps=0, texture_size=texture)
-            tight = len(mesh.faces) <= TIGHT_TRIANGLES
-            atlas = unwrap(mesh.positions, mesh.faces, texture, gutter(len(mesh.faces), other), tight)
+            atlas = unwrap(mesh.positions, mesh.faces, texture, gutter(len(mesh.faces), other))
             return transferred(self.reference, atlas, other), False
 
         key = hashlib.sha256(json.dumps(as_dict(options), sort_keys=True).encode() + self._path.read_bytes())
