@@ -24,8 +24,6 @@ from appearance_opt.latent.displacement import DISPLACEMENT
 from appearance_opt.latent.latent import LatentMesh
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from numpy.typing import NDArray
 
     from appearance_opt.config import SimplifyOptions
@@ -101,38 +99,16 @@ def make_start(
         if options.displaced:
             return Start(mesh, {**maps, DISPLACEMENT: flat_map(mesh, options)}, False, known, options.levels())
         return Start(mesh, {**maps}, False, known)
-    merged = reference.merged
-    faces = merged.faces
-    visible = np.ones(len(faces), bool)
-    weight = np.ones(len(faces))
-    if not options.keep_hidden:
-        counts = pixel_counts(reference.scene, len(faces), sampler.held_out(2), VISIBILITY_VIEWS)
-        weight, seen = importance(merged.positions, faces, counts)
-        visible = seen if seen.sum() >= triangles else visible
-
-    def decimated(weight: NDArray) -> Start:
-        positions, low = decimate(merged.positions, faces[visible], triangles, weight[visible])
-        if not len(low):
-            raise InputError("nothing is left of this mesh at that budget; ask for more triangles")
-        return mapped(charted(positions, low), np.ones(len(low)), False)
-
-    def mapped(charts: LatentMesh, scale: NDArray, tight: bool) -> Start:
-        mesh = packed(charts, scale, size, gutter(len(charts.faces), options), tight)
-        return replace(transferred(reference, mesh, options), charts=charts)
-
+    starts = _Decimated(reference, options, sampler, triangles)
     began = time.perf_counter()
-    start = decimated(weight)
+    start = starts.weighted(starts.weight)
     taken = time.perf_counter() - began
     rounds = affordable(options.reallocate, taken, None if seconds is None else seconds - taken)
     if not rounds:
         return start
-    views = sampler.held_out(3)
-    judge = StartError(reference, views)
-    start, error = _reallocated(start, weight, visible, decimated, judge, rounds)
-    assert start.charts is not None
-    # displaced vertices read the rim of a chart on both of its sides, which asks for the same texels everywhere
-    scale = np.ones(len(start.mesh.faces)) if options.displaced else chart_scales(start.mesh, _images(start), views)
-    again = mapped(start.charts, scale, len(start.mesh.faces) <= TIGHT_TRIANGLES)
+    judge = StartError(reference, starts.views)
+    start, error = starts.moved(start, judge, rounds)
+    again = starts.spread(start, len(start.mesh.faces) <= TIGHT_TRIANGLES)
     return again if judge.measure(again.drawn, _images(again))[0] < error else start
 
 
@@ -144,25 +120,57 @@ def affordable(rounds: int, taken: float, left: float | None) -> int:
     return min(rounds, int(REALLOCATION_SHARE * max(left, 0.0) / taken))
 
 
-def _reallocated(
-    start: Start,
-    weight: NDArray,
-    visible: NDArray[np.bool_],
-    decimated: Callable[[NDArray], Start],
-    judge: StartError,
-    rounds: int,
-) -> tuple[Start, float]:
-    """The best of a start and those with triangles moved to where its image error is, and its error."""
-    merged = judge.reference.merged
-    best, (error, by_face) = start, judge.measure(start.drawn, _images(start))
-    for number in range(1, rounds + 1):
-        weight = weight * weights(merged.positions, merged.faces, by_face, visible)
-        candidate = decimated(weight)
-        again, by_face = judge.measure(candidate.drawn, _images(candidate))
-        log.info("triangles moved, round %d: squared error of the start %.3g -> %.3g", number, error, again)
-        if again < WORTHWHILE * error:
-            best, error = candidate, again
-    return best, error
+class _Decimated:
+    """Starts from the reference with fewer triangles. ``weight``: importance of its faces by how much is seen of them;
+    ``visible``: those that are decimated at all; ``views``: views that neither the fit nor its validation uses."""
+
+    def __init__(
+        self, reference: MeshReference, options: SimplifyOptions, sampler: ViewSampler, triangles: int
+    ) -> None:
+        self.reference, self.options, self.triangles = reference, options, triangles
+        self.views = sampler.held_out(3)
+        merged = reference.merged
+        count = len(merged.faces)
+        self.weight, self.visible = np.ones(count), np.ones(count, bool)
+        if not options.keep_hidden:
+            pixels = pixel_counts(reference.scene, count, sampler.held_out(2), VISIBILITY_VIEWS)
+            self.weight, seen = importance(merged.positions, merged.faces, pixels)
+            self.visible = seen if seen.sum() >= triangles else self.visible
+
+    def weighted(self, weight: NDArray) -> Start:
+        """The reference decimated with these importances of its faces (F,)."""
+        merged, visible = self.reference.merged, self.visible
+        positions, faces = decimate(merged.positions, merged.faces[visible], self.triangles, weight[visible])
+        if not len(faces):
+            raise InputError("nothing is left of this mesh at that budget; ask for more triangles")
+        return self._mapped(charted(positions, faces), np.ones(len(faces)), False)
+
+    def moved(self, start: Start, judge: StartError, rounds: int) -> tuple[Start, float]:
+        """The best of a start and those with triangles moved to where its image error is, and its error."""
+        merged, weight = self.reference.merged, self.weight
+        best, (error, by_face) = start, judge.measure(start.drawn, _images(start))
+        for number in range(1, rounds + 1):
+            weight = weight * weights(merged.positions, merged.faces, by_face, self.visible)
+            candidate = self.weighted(weight)
+            again, by_face = judge.measure(candidate.drawn, _images(candidate))
+            log.info("triangles moved, round %d: squared error of the start %.3g -> %.3g", number, error, again)
+            if again < WORTHWHILE * error:
+                best, error = candidate, again
+        return best, error
+
+    def spread(self, start: Start, tight: bool) -> Start:
+        """The same triangles, with texels moved to where they are seen to be missing. ``tight``: see ``packed``."""
+        assert start.charts is not None
+        scale = np.ones(len(start.mesh.faces))
+        # displaced vertices read the rim of a chart on both of its sides, which asks for the same texels everywhere
+        if not self.options.displaced:
+            scale = chart_scales(start.mesh, _images(start), self.views)
+        return self._mapped(start.charts, scale, tight)
+
+    def _mapped(self, charts: LatentMesh, scale: NDArray, tight: bool) -> Start:
+        options = self.options
+        mesh = packed(charts, scale, options.texture_size, gutter(len(charts.faces), options), tight)
+        return replace(transferred(self.reference, mesh, options), charts=charts)
 
 
 def _images(start: Start) -> dict[str, NDArray]:
