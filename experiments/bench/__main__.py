@@ -49,11 +49,14 @@ def main() -> None:
 def cases(quick: bool) -> dict[str, dict]:
     """Sizes to time: resolution of 4 views, triangles of latent and reference, map size, and where the reference's
     images come from: they are "kept", rendered "live" in every step with one ray per pixel, or rendered as a fit does
-    it (in every ``--reuse``-th step, finely at outlines)."""
+    it (in every ``--reuse``-th step, finely at outlines). The object fills the views; with "room" they are that much
+    wider and higher, so that it covers as much of them as a long or branched one does."""
     base = {"resolution": 256, "latent": 3000, "reference": 100_000, "maps": 512, "images": "kept"}
     live, in_fit = {**base, "images": "live"}, {**base, "images": "as in a fit"}
     out = {"256": base, "256, live reference": live, "256, as in a fit": in_fit, "128": {**base, "resolution": 128}}
     out["512, 1024 maps"] = {**base, "resolution": 512, "maps": 1024}
+    for how, case in (("live reference", live), ("as in a fit", in_fit)):
+        out[f"256, {how}, a third covered"] = {**case, "room": 1.5}
     if quick:
         return out
     out["512"] = {**base, "resolution": 512}
@@ -71,7 +74,9 @@ def in_process(case: dict, device: str) -> dict:
     return json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout.splitlines()[-1])
 
 
-def run_case(resolution: int, latent: int, reference: int, maps: int, images: str, steps: int = 24) -> dict:
+def run_case(
+    resolution: int, latent: int, reference: int, maps: int, images: str, room: float = 1.0, steps: int = 24
+) -> dict:
     """Median and range in ms of a whole step, the sum of its kernels, kernels compiled, peak memory."""
     from appearance_opt.config import CommonOptions
     from appearance_opt.fit import adam
@@ -85,7 +90,7 @@ def run_case(resolution: int, latent: int, reference: int, maps: int, images: st
     from appearance_opt.render.gradient import Quality
     from experiments.bench.scene import set_up
 
-    source, model, sampler = set_up(latent, reference, maps)
+    source, model, sampler = set_up(latent, reference, maps, room)
     grid = Grid(4, resolution)
     mesh = model.topology.mesh
     laplacian = Laplacian(mesh.positions, mesh.faces, model.edge_length, relative=True)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from appearance_opt.fit.model import Model, Rates
@@ -12,11 +14,15 @@ from appearance_opt.views import ViewSampler, framing
 from scenes.analytic import bumpy_sphere
 
 
-def set_up(latent: int, reference: int, maps: int) -> tuple[MeshReference, Model, ViewSampler]:
-    """A bumpy sphere, and a smooth coarse one with random maps as its latent. ``latent``, ``reference``: triangles."""
+def set_up(latent: int, reference: int, maps: int, room: float = 1.0) -> tuple[MeshReference, Model, ViewSampler]:
+    """A bumpy sphere, and a smooth coarse one with random maps as its latent. ``latent``, ``reference``: triangles;
+    ``room``: width of a view in units of one that the sphere fills."""
     asset = bumpy_sphere(reference)
     frame = framing(np.concatenate([m.positions for m in asset.meshes]))
     source = MeshReference(in_frame(asset, *frame))
     mesh = sphere(latent, (0.0, 0.0, 0.0), 0.93, maps)
     model = Model(mesh, random_maps(maps, 0, True), frozenset(("shape", "normal", "material")), Rates())
-    return source, model, ViewSampler((0.0, 0.0, 0.0), 1.0)
+    sampler = ViewSampler((0.0, 0.0, 0.0), 1.0)
+    if room > 1:
+        sampler = replace(sampler, hull=room * mesh.positions / np.linalg.norm(mesh.positions, axis=1, keepdims=True))
+    return source, model, sampler
