@@ -6,8 +6,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from scipy.ndimage import distance_transform_edt
 
 from appearance_opt.asset.normals import weld
+from appearance_opt.baking.points import texel_coverage
 from appearance_opt.fit.losses import LOSSES
 from appearance_opt.fit.model import POSITIONS, TEXELS, Model, Rates
 from appearance_opt.fit.step import Gradients, StepInputs
@@ -193,9 +195,12 @@ def inside_view(count: int = 2):
 def inside_model(fit: tuple[str, ...], level: int = 2, levels: tuple[int, ...] | None = None) -> Model:
     mesh = sphere(192, (0.0, 0.0, 0.0), 1.0, SIZE)
     flat = np.zeros((SIZE, SIZE), np.float32)
-    wave = smooth(SIZE, 0.2)
+    # maps that jump across a seam would move a step in the image with it, which no derivative of shading sees
+    inside = distance_transform_edt(texel_coverage(mesh, SIZE)) - 2
+    fade = np.clip(inside / 6, 0, 1).astype(np.float32)
+    wave = smooth(SIZE, 0.2) * fade
     maps = {"red": 0.5 + wave, "green": 0.4 - wave, "blue": flat + 0.3, "roughness": flat + 0.7}
-    maps.update(metalness=flat, normal_x=wave, normal_y=flat, normal_z=flat + 1, displacement=smooth(SIZE, 0.02))
+    maps.update(metalness=flat, normal_x=wave, normal_y=flat, normal_z=flat + 1, displacement=smooth(SIZE, 0.02) * fade)
     return Model(mesh, maps, frozenset(fit), Rates(), levels or (level,))
 
 
@@ -228,8 +233,8 @@ def test_derivatives_of_the_image(of: str) -> None:
             values.append(run()[0])
         numeric = (values[0] - values[1]) / 1e-2
         predicted = float(slope @ direction)
-        # measured 0.1 % (positions), 0.002 % (texels) of the largest derivative that such a direction can have
-        assert abs(predicted - numeric) < 0.004 * np.linalg.norm(slope) * np.linalg.norm(direction)
+        # measured 0.001 % (positions, displacement), 0.002 % (texels) of the largest derivative of such a direction
+        assert abs(predicted - numeric) < 2e-4 * np.linalg.norm(slope) * np.linalg.norm(direction)
 
 
 def broad_direction(of: str, model: Model, seed: int) -> np.ndarray:

@@ -84,7 +84,8 @@ def test_texel_gradients_agree_with_finite_differences() -> None:
 @pytest.mark.parametrize("channel", ["red", "roughness", "metalness", "normal_x", "normal_y"])
 def test_each_channel_has_its_own_correct_gradient(channel: str) -> None:
     model, grid, quality = make_model(), Grid(2, 48), Quality(0.0, 1, 1)
-    inputs = make_inputs(model, grid, 2)
+    # views in which differences of steps of 1e-4 to 1e-2 agree: in others a pixel crosses the terminator between them
+    inputs = make_inputs(model, grid, 4)
     loss = LOSSES["log-srgb-l2"]
     codec, parameter = model.codec, model.parameters[TEXELS]
     assert codec is not None
@@ -100,7 +101,7 @@ def test_each_channel_has_its_own_correct_gradient(channel: str) -> None:
         values.append(float(Gradients(model, grid, quality, loss, freeze=False)(inputs)[0][0]))
     numeric = (values[0] - values[1]) / 2e-3
     # measured below 0.1 % for every channel
-    assert predicted == pytest.approx(numeric, rel=0.01)
+    assert predicted == pytest.approx(numeric, rel=0.003)
 
 
 def coverage_derivative(density: float, samples: int) -> tuple[float, float]:
