@@ -120,7 +120,7 @@ def test_strips_become_triangles_of_one_winding(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"extensionsRequired": ["EXT_meshopt_compression"]}, "meshopt"),
+        ({"extensionsRequired": ["KHR_texture_basisu"]}, "Basis Universal"),
         ({"asset": {"version": "1.0"}}, "version"),
         ({"meshes": []}, "broken"),
         ({"bufferViews": [{"buffer": 0, "byteLength": 3600}]}, "cut short"),
@@ -207,6 +207,80 @@ def test_without_the_package_draco_names_it_or_takes_the_other_data(
     with pytest.raises(InputError, match=r"pip install 'appearance-opt\[draco\]'"):
         load(tmp_path / "alone.glb")
     assert len(load(tmp_path / "both.glb").meshes[0].faces) == 1
+
+
+def meshopt_document(extension: str = "EXT_meshopt_compression", filtered: bool = False) -> tuple[dict, bytes]:
+    """QUAD as gltfpack would write it: compressed positions and triangles, and a buffer that only stands for the
+    plain ones; ``filtered``: positions as mantissas of 20 bits that share their exponents."""
+    meshopt = pytest.importorskip("meshopt")
+    points, _, faces = QUAD
+    faces = faces.astype(np.uint16)
+    stored = meshopt.encode_filter_exp(points, 20) if filtered else points
+    parts = [meshopt.encode_gltf_buffer(stored, "ATTRIBUTES"), meshopt.encode_gltf_buffer(faces, "TRIANGLES")]
+    lengths = [len(p) for p in parts]
+    packed = [
+        {"count": len(points), "byteStride": 12, "mode": "ATTRIBUTES", "filter": "EXPONENTIAL" if filtered else "NONE"},
+        {"count": faces.size, "byteStride": 2, "mode": "TRIANGLES"},
+    ]
+    for k, (view, length) in enumerate(zip(packed, lengths, strict=True)):
+        view.update(buffer=0, byteOffset=lengths[0] * k, byteLength=length)
+    document, _ = triangle_document(
+        meshes=[{"primitives": [{"attributes": {"POSITION": 0}, "indices": 1}]}],
+        accessors=[
+            {"bufferView": 0, "componentType": 5126, "type": "VEC3", "count": len(points)},
+            {"bufferView": 1, "componentType": 5123, "type": "SCALAR", "count": faces.size},
+        ],
+        bufferViews=[
+            {"buffer": 1, "byteLength": 48, "byteStride": 12, "extensions": {extension: packed[0]}},
+            {"buffer": 1, "byteOffset": 48, "byteLength": 12, "extensions": {extension: packed[1]}},
+        ],
+        buffers=[{"byteLength": sum(lengths)}, {"byteLength": 60, "extensions": {extension: {"fallback": True}}}],
+        extensionsUsed=[extension],
+        extensionsRequired=[extension],
+    )
+    return document, b"".join(parts)
+
+
+@pytest.mark.parametrize("extension", ["EXT_meshopt_compression", "KHR_meshopt_compression"])
+@pytest.mark.parametrize("filtered", [False, True])
+def test_meshopt_compressed_geometry(tmp_path: Path, extension: str, filtered: bool) -> None:
+    points, _, faces = QUAD
+    write_glb(tmp_path / "x.glb", *meshopt_document(extension, filtered))
+    mesh = load(tmp_path / "x.glb").meshes[0]
+    found, wanted = (sorted(map(sorted, p.tolist())) for p in (mesh.positions[mesh.faces], points[faces]))
+    np.testing.assert_allclose(found, wanted, atol=1e-5 if filtered else 0)
+
+
+@pytest.mark.parametrize("change", [{"count": 2**40}, {"count": -3}, {"byteStride": 13}, {"mode": "POINTS"}])
+def test_meshopt_data_that_cannot_be_is_refused(tmp_path: Path, change: dict) -> None:
+    document, data = meshopt_document()
+    document["bufferViews"][0]["extensions"]["EXT_meshopt_compression"].update(change)
+    write_glb(tmp_path / "x.glb", document, data)
+    with pytest.raises(InputError, match="meshopt data is damaged"):
+        load(tmp_path / "x.glb")
+
+
+def test_damaged_meshopt_data_is_refused(tmp_path: Path) -> None:
+    document, data = meshopt_document()
+    write_glb(tmp_path / "x.glb", document, b"\0" * len(data))
+    with pytest.raises(InputError, match="meshopt data is damaged"):
+        load(tmp_path / "x.glb")
+
+
+def test_without_the_package_meshopt_names_it_or_takes_the_fallback(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    document, data = meshopt_document()
+    write_glb(tmp_path / "alone.glb", document, data)
+    document["buffers"][1]["uri"] = "plain.bin"
+    write_glb(tmp_path / "both.glb", document, data)
+    points, _, faces = QUAD
+    (tmp_path / "plain.bin").write_bytes(points.tobytes() + faces.astype(np.uint16).tobytes())
+    monkeypatch.setitem(sys.modules, "meshopt", None)
+    with pytest.raises(InputError, match=r"pip install 'appearance-opt\[meshopt\]'"):
+        load(tmp_path / "alone.glb")
+    mesh = load(tmp_path / "both.glb").meshes[0]
+    np.testing.assert_array_equal(mesh.positions[mesh.faces], points[faces])
 
 
 def test_non_finite_positions_are_refused(tmp_path: Path) -> None:

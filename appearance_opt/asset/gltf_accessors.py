@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from appearance_opt.asset import gltf_meshopt
 from appearance_opt.asset.paths import read_bytes
 from appearance_opt.errors import InputError
 
@@ -45,6 +46,7 @@ class Document:
                 f"{path}: glTF version {self.json['asset'].get('version')} is not supported; convert to 2.0"
             )
         self._buffers: dict[int, bytes] = {}
+        self._decompressed: dict[int, bytes] = {}
 
     def items(self, kind: str) -> list[dict[str, Any]]:
         """A top-level array of the JSON, empty when absent."""
@@ -62,11 +64,12 @@ class Document:
     def buffer_view(self, index: int) -> tuple[bytes, int]:
         """(bytes, stride or 0) of a buffer view."""
         view = self.items("bufferViews")[index]
-        data = self._buffer(view["buffer"])
-        start, length = view.get("byteOffset", 0), view["byteLength"]
-        if start < 0 or length < 0 or start + length > len(data):
-            raise InputError(f"{self.path}: buffer view {index} reaches beyond its buffer; the file is cut short")
-        return data[start : start + length], view.get("byteStride", 0)
+        packed = gltf_meshopt.compressed(view)
+        if packed is None:
+            return self._slice(view, index), view.get("byteStride", 0)
+        if index not in self._decompressed:
+            self._decompressed[index] = self._decompress(view, packed, index)
+        return self._decompressed[index], view.get("byteStride", 0)
 
     def accessor(self, index: int) -> NDArray:
         """(count, width) array: floats for float and normalized types, integers otherwise."""
@@ -104,6 +107,22 @@ class Document:
         if count < 0 or offset < 0 or (count and offset + stride * (count - 1) + kind.itemsize * width > len(data)):
             raise InputError(f"{self.path}: an accessor reaches beyond its buffer view; the file is cut short")
         return np.ndarray((count, width), kind.newbyteorder("<"), data, offset, (stride, kind.itemsize))
+
+    def _slice(self, extent: dict[str, Any], index: int) -> bytes:
+        data = self._buffer(extent["buffer"])
+        start, length = extent.get("byteOffset", 0), extent["byteLength"]
+        if start < 0 or length < 0 or start + length > len(data):
+            raise InputError(f"{self.path}: buffer view {index} reaches beyond its buffer; the file is cut short")
+        return data[start : start + length]
+
+    def _decompress(self, view: dict[str, Any], packed: dict[str, Any], index: int) -> bytes:
+        """A view's plain bytes; those of its fallback buffer if the package is missing and there is one."""
+        try:
+            return gltf_meshopt.decompress(self._slice(packed, index), packed, str(self.path))
+        except gltf_meshopt.PackageMissing:
+            if "uri" not in self.items("buffers")[view["buffer"]]:
+                raise
+            return self._slice(view, index)
 
     def _buffer(self, index: int) -> bytes:
         if index not in self._buffers:

@@ -10,6 +10,7 @@ import numpy as np
 from appearance_opt.asset.gltf_accessors import Document
 from appearance_opt.asset.gltf_draco import DRACO, Compressed
 from appearance_opt.asset.gltf_materials import READ_EXTENSIONS, MaterialReader
+from appearance_opt.asset.gltf_meshopt import MESHOPT
 from appearance_opt.asset.types import Asset, Mesh
 from appearance_opt.errors import InputError
 
@@ -18,11 +19,8 @@ if TYPE_CHECKING:
 
     from appearance_opt.asset.companions import Companions
 
-_COMPRESSED = {
-    "EXT_meshopt_compression": "meshopt",
-    "KHR_texture_basisu": "Basis Universal",
-}
-_HARMLESS = {DRACO, "KHR_mesh_quantization", *READ_EXTENSIONS}
+_COMPRESSED = {"KHR_texture_basisu": "Basis Universal"}
+_HARMLESS = {DRACO, *MESHOPT, "KHR_mesh_quantization", *READ_EXTENSIONS}
 
 
 def load_gltf(path: Path, companions: Companions) -> Asset:
