@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from appearance_opt.baking.points import TexelPoints, texel_coverage
 from appearance_opt.initial.atlas import charted, charts_of, packed, unwrap, uv_areas
@@ -50,6 +51,26 @@ def test_scaled_charts_get_more_texels_and_do_not_overlap(tight: bool) -> None:
     assert np.median(gain[large]) == pytest.approx(4 * np.median(gain[~large]), rel=0.1)
     # measured 1 percent: what overlapped would be covered once and counted twice
     assert texel_coverage(mesh, SIZE).mean() == pytest.approx(uv_areas(mesh).sum(), rel=0.05)
+
+
+@pytest.mark.parametrize("gutter", [4, 8])
+@pytest.mark.parametrize("tight", [False, True])
+def test_charts_are_as_far_apart_as_they_are_meant_to_be(gutter: int, tight: bool) -> None:
+    charts = charted(BALL.positions, BALL.faces)
+    mesh = packed(charts, np.ones(len(BALL.faces)), SIZE, gutter, tight)
+    points = TexelPoints(mesh, SIZE).band(0, 0.5, 0.5)
+    assert points is not None
+    chart = np.full(SIZE * SIZE, -1)
+    chart[np.array(points.texel)] = charts_of(mesh)[np.array(points.triangle)]
+    chart = chart.reshape(SIZE, SIZE)
+    # texels between the nearest texels of any two charts, along rows or columns and diagonally
+    far = SIZE * SIZE
+    largest = [ndimage.maximum_filter(chart, 2 * k + 1) for k in range(gutter + 4)]
+    smallest = [ndimage.minimum_filter(np.where(chart < 0, far, chart), 2 * k + 1) for k in range(gutter + 4)]
+    meets = [((a >= 0) & (a != b)).any() for a, b in zip(largest, smallest, strict=True)]
+    # a square of 2 k + 1 texels that touches two charts spans at most 2 k - 1 between them
+    nearest = 2 * meets.index(True) - 1
+    assert gutter <= nearest <= gutter + 3
 
 
 def test_gutters_yield_where_charts_do_not_fit() -> None:
