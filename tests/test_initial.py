@@ -178,10 +178,12 @@ def test_texels_that_nobody_sees_are_filled_smoothly() -> None:
     assert plain.hidden.sum() == filled.missed.sum() == 0
     seen = filled.covered & ~filled.hidden
     np.testing.assert_array_equal(after[seen], before[seen])
-    # what is filled varies slowly between neighbours (measured 0.022; 0.52 without)
+    # what is filled varies slowly between neighbours, by 6 to 12 % of what noise does (0.28 to 0.31) with five ways
+    # of packing: a chart that nobody sees takes its colours from whatever lies beside it
     both = filled.hidden[:, 1:] & filled.hidden[:, :-1]
-    assert np.abs(np.diff(before, axis=1))[both].max() > 0.1
-    assert 0 < np.abs(np.diff(after, axis=1))[both].max() < 0.03
+    noise, left = (np.abs(np.diff(x, axis=1))[both].max() for x in (before, after))
+    assert noise > 0.2
+    assert 0 < left < 0.2 * noise
 
 
 def test_fill_is_smooth_and_leaves_known_texels() -> None:
