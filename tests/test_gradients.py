@@ -84,24 +84,28 @@ def test_texel_gradients_agree_with_finite_differences() -> None:
 @pytest.mark.parametrize("channel", ["red", "roughness", "metalness", "normal_x", "normal_y"])
 def test_each_channel_has_its_own_correct_gradient(channel: str) -> None:
     model, grid, quality = make_model(), Grid(2, 48), Quality(0.0, 1, 1)
-    # views in which differences of steps of 1e-4 to 1e-2 agree: in others a pixel crosses the terminator between them
-    inputs = make_inputs(model, grid, 4)
     loss = LOSSES["log-srgb-l2"]
     codec, parameter = model.codec, model.parameters[TEXELS]
     assert codec is not None
     index = codec.channels.index(channel)
-    _, grads = Gradients(model, grid, quality, loss, freeze=False)(inputs)
-    predicted = float(np.array(grads[TEXELS]).reshape(-1, codec.packed)[:, index].astype(np.float64).sum())
     start = np.array(parameter.value).reshape(-1, codec.packed)
-    values = []
-    for sign in (1, -1):
-        moved = start.copy()
-        moved[:, index] += sign * 1e-3
-        parameter.value = mi.Float(moved.ravel())
-        values.append(float(Gradients(model, grid, quality, loss, freeze=False)(inputs)[0][0]))
-    numeric = (values[0] - values[1]) / 2e-3
-    # measured below 0.1 % for every channel
-    assert predicted == pytest.approx(numeric, rel=0.003)
+    predicted, numeric = [], []
+    for seed in range(7):
+        inputs = make_inputs(model, grid, seed)
+        parameter.value = mi.Float(start.ravel())
+        _, grads = Gradients(model, grid, quality, loss, freeze=False)(inputs)
+        predicted.append(float(np.array(grads[TEXELS]).reshape(-1, codec.packed)[:, index].astype(np.float64).sum()))
+        values = []
+        for sign in (1, -1):
+            moved = start.copy()
+            moved[:, index] += sign * 1e-3
+            parameter.value = mi.Float(moved.ravel())
+            values.append(float(Gradients(model, grid, quality, loss, freeze=False)(inputs)[0][0]))
+        numeric.append((values[0] - values[1]) / 2e-3)
+    error = np.abs(np.subtract(predicted, numeric)) / np.sqrt(np.mean(np.square(predicted)))
+    # in some views a pixel crosses the terminator, where the loss has a kink, between the two differences; most agree
+    # to 0.03 % of a typical derivative, and a gradient that is off by 0.3 % is off in all views
+    assert np.median(error) < 0.003
 
 
 def coverage_derivative(density: float, samples: int) -> tuple[float, float]:

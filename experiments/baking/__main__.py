@@ -165,10 +165,10 @@ def angles(baked: Path, theirs: np.ndarray) -> dict:
     return out
 
 
-def judge(source: Path, candidates: dict[str, str], stem: Path, views: int) -> dict:
-    """Scores by candidate."""
+def judge(source: Path, candidates: dict[str, str], stem: Path, views: int, seed: int = 1234) -> dict:
+    """Scores by candidate. ``seed``: of the views."""
     scores = Path(f"{stem}.judge.json")
-    options = ["--views", str(views), "--spp", "36", "--json", str(scores)]
+    options = ["--views", str(views), "--spp", "36", "--seed", str(seed), "--json", str(scores)]
     command = [sys.executable, str(JUDGE / "evaluate.py"), str(source), *candidates.values(), *options]
     subprocess.run(command, check=True, capture_output=True, cwd=JUDGE)
     return dict(zip(candidates, json.loads(scores.read_text())["candidates"], strict=True))

@@ -1,12 +1,14 @@
 """Does a result lose more in another renderer than another tool's result does?
 
-    python -m experiments.quality.drop --blender BPY/bin/python [--rows spot:1404,...]
+    python -m experiments.quality.drop --blender BPY/bin/python [--rows spot:1404,...] [--seeds 4]
 
 The PSNR of our result and of Blender's (decimate, unwrap, Cycles bake) against the same reference, by our own
 ``compare`` and by the neutral renderer in ``../shared/judge``. Both look from other places under other lights, so
 only the difference of the two drops says something: fitting to images of our own renderer could make a result that
-suits that renderer alone. Needs the results of ``python -m experiments.quality`` and Blender's package in an
-environment of its own (see experiments/baking). What is on disk in ``out/drop`` is not made again.
+suits that renderer alone. ``--seeds``: sets of 24 views, whose means are taken; with several, the table says how far
+the difference of the two drops is known (standard error over the sets). Needs the results of ``python -m
+experiments.quality`` and Blender's package in an environment of its own (see experiments/baking). What is on disk in
+``out/drop`` is not made again.
 """
 
 from __future__ import annotations
@@ -23,6 +25,9 @@ from experiments.baking.__main__ import SIZE, judge, maps_of_blender
 from experiments.quality.__main__ import JUDGE, OUT, ROOT, ROWS
 
 FOLDER = ROOT / "out" / "drop"
+VIEWS, FIRST_SEED = 24, 1234
+"""Views of a set, and the neutral renderer's seed for the first one."""
+
 REACH = 0.02
 """Blender's cage, in units of the reference's radius."""
 
@@ -47,8 +52,8 @@ def blender_result(python: str, reference: Path, triangles: int, stem: Path) -> 
     return result
 
 
-def run_row(python: str, asset: str, triangles: int) -> dict:
-    """Scores of both results in both renderers."""
+def run_row(python: str, asset: str, triangles: int, seeds: int) -> dict:
+    """Scores of both results in both renderers: PSNR by tool, by renderer, one for each set of views."""
     from appearance_opt import compare
 
     FOLDER.mkdir(parents=True, exist_ok=True)
@@ -58,33 +63,43 @@ def run_row(python: str, asset: str, triangles: int) -> dict:
         "ours": str(OUT / f"{asset}_{triangles}_default.glb"),
         "blender": str(blender_result(python, reference, triangles, stem)),
     }
-    judged = judge(reference, candidates, stem, 24)
-    row: dict = {"asset": asset, "triangles": triangles}
-    for name, path in candidates.items():
-        own = compare(reference, path, views=24).metrics.psnr_covered
-        row[name] = {"compare": own, "judge": judged[name]["psnr_cov"]}
+    row: dict = {"asset": asset, "triangles": triangles} | {n: {"compare": [], "judge": []} for n in candidates}
+    for k in range(seeds):
+        judged = judge(reference, candidates, stem, VIEWS, FIRST_SEED + k)
+        for name, path in candidates.items():
+            row[name]["judge"].append(judged[name]["psnr_cov"])
+            row[name]["compare"].append(compare(reference, path, views=VIEWS, seed=k).metrics.psnr_covered)
     return row
+
+
+def table_line(row: dict) -> str:
+    """Markdown: means over the sets of views, and how much more ours drops, with its standard error."""
+    drops, cells = [], []
+    for name in ("ours", "blender"):
+        own, judged = (np.array(row[name][k]) for k in ("compare", "judge"))
+        drops.append(own - judged)
+        cells.append(f"{own.mean():.2f}, {judged.mean():.2f}, {drops[-1].mean():+.2f}")
+    more = drops[0] - drops[1]
+    known = f" ± {more.std(ddof=1) / len(more) ** 0.5:.2f}" if len(more) > 1 else ""
+    return f"| {row['asset']}, {row['triangles']} | {cells[0]} | {cells[1]} | {more.mean():+.2f}{known} |"
 
 
 def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--blender", required=True, metavar="PYTHON")
     parser.add_argument("--rows", default="spot:1404,chess_king:2432,flight_helmet:1367")
+    parser.add_argument("--seeds", type=int, default=1)
     a = parser.parse_args()
     if not JUDGE.exists():
         sys.exit(f"{JUDGE} is not there: this experiment needs the neutral renderer and its references")
     wanted = {tuple(r.split(":")) for r in a.rows.split(",")}
-    print("| asset, triangles | ours: compare, judge, drop (dB) | Blender: compare, judge, drop (dB) |\n|---|---|---|")
+    print("| asset, triangles | ours: compare, judge, drop (dB) | Blender: compare, judge, drop (dB) | more |")
+    print("|---|---|---|---|")
     rows = []
     for asset, _, triangles in ROWS:
-        if (asset, str(triangles)) not in wanted:
-            continue
-        rows.append(run_row(a.blender, asset, triangles))
-        cells = [
-            f"{s['compare']:.2f}, {s['judge']:.2f}, {s['compare'] - s['judge']:+.2f}"
-            for s in (rows[-1]["ours"], rows[-1]["blender"])
-        ]
-        print(f"| {asset}, {triangles} | {cells[0]} | {cells[1]} |", flush=True)
+        if (asset, str(triangles)) in wanted:
+            rows.append(run_row(a.blender, asset, triangles, a.seeds))
+            print(table_line(rows[-1]), flush=True)
     (FOLDER / "drop.json").write_text(json.dumps(rows, indent=1))
 
 
