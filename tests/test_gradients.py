@@ -227,7 +227,7 @@ def test_pyramid_hands_gradients_down_to_all_texels() -> None:
     np.testing.assert_array_equal(down[..., 1], 0)
 
 
-def test_laplacian_is_scale_free_and_zero_at_the_start(variant: str) -> None:
+def test_laplacian_is_scale_free_and_zero_at_the_start() -> None:
     mesh = sphere(300, (0.0, 0.0, 0.0), 1.0, 16)
     rng = np.random.default_rng(0)
     noise = rng.normal(scale=0.01, size=mesh.positions.shape).astype(np.float32)
@@ -235,9 +235,11 @@ def test_laplacian_is_scale_free_and_zero_at_the_start(variant: str) -> None:
     for scale in (1.0, 1000.0):
         p = mesh.positions * np.float32(scale)
         laplacian = Laplacian(p, mesh.faces, local_edge_length(p, mesh.faces), relative=True)
-        # a mean of squares of relative differences, of which fused operations on a GPU leave 3e-15
-        assert float(laplacian(mi.Float(p.ravel()))[0]) <= (0.0 if variant.startswith("llvm") else 1e-13)
+        # a mean of squares of relative differences: the neighbours of a vertex are added in any order, of which
+        # rounding leaves 6e-15 once in some hundred runs (noise of a hundredth leaves 1e-3)
+        assert float(laplacian(mi.Float(p.ravel()))[0]) < 1e-13
         values.append(float(laplacian(mi.Float((p + noise * scale).ravel()))[0]))
+    assert values[0] > 1e-4
     assert values[0] == pytest.approx(values[1], rel=1e-3)
 
 
