@@ -16,9 +16,9 @@ class PackageMissing(InputError):
     """The package that decompresses is not installed."""
 
 
-def compressed(owner: dict[str, Any]) -> dict[str, Any] | None:
-    """What a buffer view says of its compressed data, or a buffer of its being a mere placeholder."""
-    extensions = owner.get("extensions", {})
+def compressed(view: dict[str, Any]) -> dict[str, Any] | None:
+    """What a buffer view says of its compressed data, None if it has none."""
+    extensions = view.get("extensions", {})
     return next((extensions[name] for name in MESHOPT if name in extensions), None)
 
 

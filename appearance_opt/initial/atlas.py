@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 GUTTER = 4
 """Empty texels between charts, enough for one mip level and its bilinear lookups. With half as many, or half as many
-again, starts of chess_king, spot and flight_helmet differ by less than 0.1 dB."""
+again, starts of chess_king, spot and flight_helmet are 0.12 dB worse to 0.04 dB better."""
 
 FILLED, TRIES, SMALLEST = 0.6, 3, 0.5
 """First guess at the share of a texture that charts fill, how often the length of texels that follows from it is
