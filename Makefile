@@ -3,16 +3,19 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
-# a test must find one core as well as many
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: help demo test lint bench docs quality clean
+.PHONY: help demo test slow lint bench docs quality clean
 
 help:
 	@echo "make demo     simplify the embedded scene to 2 % of its triangles (out/demo)"
 	@echo "make test     linters, type checker, tests"
+	@echo "make slow     the tests that take minutes each"
+	@echo "make lint     linters and type checker alone"
 	@echo "make bench    time a step and its stages (docs/performance.md)"
+	@echo "make quality  compare with other tools (docs/quality.md; needs the folder ../shared, see docs/reproduce.md)"
 	@echo "make docs     render docs/ to out/docs"
+	@echo "make clean    remove .venv, out and what building left"
 
 $(STAMP): pyproject.toml scripts/setup.sh
 	PYTHON=$(PYTHON) bash scripts/setup.sh $(VENV)
@@ -30,6 +33,9 @@ lint: $(STAMP)
 
 test: lint
 	$(BIN)/python -m pytest
+
+slow: $(STAMP)
+	$(BIN)/python -m pytest -m slow
 
 bench: $(STAMP)
 	$(BIN)/python -m experiments.bench

@@ -8,7 +8,6 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from conftest import grid_sphere, make_asset
 
 from appearance_opt.asset.types import Asset, Material, Mesh, Texture
 from appearance_opt.fit.losses import LOSSES
@@ -22,6 +21,7 @@ from appearance_opt.reference.pool import Targets
 from appearance_opt.render.deferred import Grid, render_image
 from appearance_opt.render.gradient import Quality
 from appearance_opt.views import Views, ViewSampler, look_at
+from tests.conftest import grid_sphere, make_asset
 
 SAMPLER = ViewSampler((0.0, 0.0, 0.0), 1.0, seed=5)
 CHANNELS = {

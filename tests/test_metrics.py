@@ -31,7 +31,7 @@ def image(shown: NDArray | float, coverage: NDArray | float = 1.0, size: int = 3
 
 
 def disc(radius: float, x: float, size: int = 64, fine: int = 32) -> NDArray[np.float32]:
-    """A grey disc whose middle lies ``x`` pixels right of the image's; coverage by ``fine`` squared samples per pixel."""
+    """Grey, its middle ``x`` pixels right of the image's; coverage by ``fine``^2 samples per pixel."""
     at = (np.arange(size * fine) + 0.5) / fine - size / 2
     inside = (at[None] - x) ** 2 + at[:, None] ** 2 < radius**2
     return image(0.5, inside.reshape(size, fine, size, fine).mean(axis=(1, 3)), size)
