@@ -1,4 +1,4 @@
-"""What experiments share: their assets, results that are kept row by row, and welded geometry."""
+"""What experiments share: their assets, the neutral renderer, frames, and results that are kept row by row."""
 
 from __future__ import annotations
 
@@ -16,21 +16,63 @@ if TYPE_CHECKING:
     from appearance_opt.asset.types import Asset
 
 ROOT = Path(__file__).resolve().parents[1]
+ASSETS = ROOT.parent / "shared" / "assets"
+"""Models as they are published (docs/reproduce.md)."""
+
 JUDGE = ROOT.parent / "shared" / "judge"
-"""A renderer that is not ours, and reference GLBs."""
+"""A renderer that is not ours, and the same models as heavy GLBs."""
 
 OUT = ROOT / "out"
 
 
-def source_of(asset: str) -> Path:
-    """The heavy asset; the procedural ones are built when they are first asked for."""
-    if asset != "relic":
-        return JUDGE / "references" / f"{asset}.glb"
-    path = OUT / "scenes" / f"{asset}.glb"
+class Missing(SystemExit):
+    """A file that an experiment needs is not there: ends the program with one line, unless it is caught."""
+
+
+def asset(name: str) -> Path:
+    """A published model, by its path in ``ASSETS``. Raises Missing."""
+    return _there(ASSETS / name)
+
+
+def source_of(name: str) -> Path:
+    """The heavy GLB of that name; the embedded scene is built when it is first asked for. Raises Missing."""
+    if name != "relic":
+        return _there(JUDGE / "references" / f"{name}.glb")
+    path = OUT / "scenes" / f"{name}.glb"
     if not path.exists():
         path.parent.mkdir(parents=True, exist_ok=True)
-        subprocess.run([sys.executable, "-m", "scenes.build", asset, str(path)], check=True, cwd=ROOT)
+        subprocess.run([sys.executable, "-m", "scenes.build", name, str(path)], check=True, cwd=ROOT)
     return path
+
+
+def needs_judge() -> None:
+    """Raises Missing if the neutral renderer is not there."""
+    _there(JUDGE / "evaluate.py")
+
+
+def _there(path: Path) -> Path:
+    if not path.is_file():
+        raise Missing(f"{path} is not there: docs/reproduce.md says what experiments need")
+    return path
+
+
+def judge(
+    source: Path,
+    candidates: dict[str, str],
+    stem: Path,
+    views: int,
+    *,
+    seed: int = 1234,
+    pictures: Path | None = None,
+) -> dict[str, dict]:
+    """Scores of the neutral renderer by candidate (a GLB by name), also written to ``<stem>.judge.json``. ``seed``: of
+    the views. ``pictures``: a folder for what was seen."""
+    scores = Path(f"{stem}.judge.json")
+    options = ["--views", str(views), "--spp", "36", "--seed", str(seed), "--json", str(scores)]
+    options += [] if pictures is None else ["--dump", str(pictures)]
+    command = [sys.executable, str(JUDGE / "evaluate.py"), str(source), *candidates.values(), *options]
+    subprocess.run(command, check=True, capture_output=True, cwd=JUDGE)
+    return dict(zip(candidates, json.loads(scores.read_text())["candidates"], strict=True))
 
 
 class Framed:
@@ -55,11 +97,14 @@ class Kept:
         self.path = path
         self.rows: list[dict] = json.loads(path.read_text()) if path.exists() else []
 
+    def of(self, key: dict) -> list[dict]:
+        """The rows that have all of these values."""
+        return [r for r in self.rows if all(r.get(k) == v for k, v in key.items())]
+
     def row(self, key: dict, run: Callable[[], dict]) -> dict:
         """The row of ``key`` (its values must survive JSON), made by ``run`` if it is not there."""
-        for r in self.rows:
-            if all(r.get(k) == v for k, v in key.items()):
-                return r
+        for r in self.of(key):
+            return r
         row = {**key, **run()}
         self.rows.append(row)
         self.path.parent.mkdir(parents=True, exist_ok=True)

@@ -7,26 +7,31 @@ python -m experiments.accuracy --images        # and our image against Mitsuba's
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
+from typing import TYPE_CHECKING
 
 from appearance_opt import backend
 from experiments import mitsuba_peer
+from experiments.common import asset
 
-ASSETS = Path(__file__).resolve().parents[3] / "shared" / "assets"
-WITH_NORMAL_MAPS = "flight_helmet/*.gltf"
-MODELS = ("spot/spot.obj", "teapot/*.obj", "flight_helmet/*.gltf", "elephant/*.obj")
+if TYPE_CHECKING:
+    from pathlib import Path
+
+HELMET = "flight_helmet/FlightHelmet.gltf"
+MODELS = (("spot/spot.obj", False), (HELMET, False), (HELMET, True))
+"""Published models, and whether they are drawn with their normal maps."""
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--images", action="store_true")
     arguments = parser.parse_args()
+    models = [(asset(name), mapped) for name, mapped in MODELS] if arguments.images else []
     backend.select("cpu")
     functions()
     physics_tables()
     texture_tables()
-    if arguments.images:
-        image_table()
+    if models:
+        image_table(models)
 
 
 def functions() -> None:
@@ -68,16 +73,15 @@ def texture_tables() -> None:
     print(f"| trilinear | 64 x 64 | {textures.trilinear((64, 64)):.1e} |")
 
 
-def image_table() -> None:
+def image_table(models: list[tuple[Path, bool]]) -> None:
     from experiments.accuracy.images import compare
 
     mitsuba_peer.register()
     print("\n| model | PSNR | pixels that differ by more than 2 / 255 |\n|---|---|---|")
-    for pattern, normal_maps in [*((m, False) for m in MODELS), (WITH_NORMAL_MAPS, True)]:
-        for path in sorted(ASSETS.glob(pattern))[:1]:
-            result = compare(path, normal_maps=normal_maps)
-            name = f"{path.stem}, with normal maps" if normal_maps else path.stem
-            print(f"| {name} | {result.psnr:.1f} dB | {100 * result.differing:.2f} % |")
+    for path, normal_maps in models:
+        result = compare(path, normal_maps=normal_maps)
+        name = f"{path.stem}, with normal maps" if normal_maps else path.stem
+        print(f"| {name} | {result.psnr:.1f} dB | {100 * result.differing:.2f} % |")
 
 
 if __name__ == "__main__":

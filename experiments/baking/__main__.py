@@ -20,41 +20,18 @@ from __future__ import annotations
 import argparse
 import json
 import subprocess
-import sys
 import time
-from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from experiments.common import JUDGE, source_of
-from experiments.common import OUT as RESULTS
+from experiments.baking.pairs import OUT, ROWS, SIZE, make_low, maps_of_blender
+from experiments.common import judge, needs_judge, source_of
 
-if TYPE_CHECKING:
-    from appearance_opt.asset.types import Mesh
-
-OUT = RESULTS / "baking"
-ROWS = {"chess_king": 4864, "flight_helmet": 2820, "relic": 8182}
-SIZE = 1024
 CAGES = (1.0, 1 / 4, 1 / 16)
 """Blender's cages, in units of the reach of our rays."""
 
 METRICS = (("psnr_cov", 2), ("flip", 4), ("sil_shift_px", 3))
-
-
-def make_low(source: Path, triangles: int, path: Path) -> None:
-    """Decimated and unwrapped, no material."""
-    from appearance_opt import save
-    from appearance_opt.asset import load
-    from appearance_opt.asset.types import Asset, Mesh
-    from appearance_opt.config import simplify_options
-    from appearance_opt.jobs.simplify import simplify
-
-    options = simplify_options("draft", triangles=triangles, steps=0, pool=4, texture_size=SIZE)
-    low = simplify(load(source), None, options).start.meshes[0]
-    bare = Mesh(low.positions, low.faces, low.normals, low.uvs, low.tangents, name="low")
-    save(Asset((bare,), "low"), path)
 
 
 def ours(source: Path, low: Path, stem: Path, preset: str, steps: int | None) -> dict:
@@ -125,24 +102,6 @@ def blender_asset(stem: Path, folder: Path) -> None:
     save(Asset((mesh,), "blender"), f"{stem}_blender.glb")
 
 
-def maps_of_blender(mesh: Mesh, folder: Path) -> Mesh:
-    """A mesh with the maps that blender_bake.py has written to ``folder``."""
-    from appearance_opt.asset.types import Material, Texture
-
-    maps = {n: np.load(folder / f"{n}.npy") for n in ("normal", "base_color", "roughness", "metalness")}
-    byte = {n: np.round(m / 257).astype(np.uint8) for n, m in maps.items()}
-    orm = np.stack([np.full((SIZE, SIZE), 255, np.uint8), byte["roughness"][..., 0], byte["metalness"][..., 0]], -1)
-    clamp = ("clamp", "clamp")
-    material = Material(
-        roughness=1.0,
-        metalness=1.0,
-        base_color_texture=Texture(byte["base_color"], "srgb", clamp),
-        orm_texture=Texture(orm, "linear", clamp),
-        normal_texture=Texture(byte["normal"], "linear", clamp),
-    )
-    return replace(mesh, material=material)
-
-
 def angles(baked: Path, theirs: np.ndarray) -> dict:
     """Degrees between the normal map of a file and one of Blender, over covered texels ("all"), and over those whose
     normal in Blender's map points out of LOW ("outward"). The others show the back of a triangle of HIGH, where
@@ -163,15 +122,6 @@ def angles(baked: Path, theirs: np.ndarray) -> dict:
     for name, some in (("all", angle), ("outward", angle[outward])):
         out |= {f"{name}_mean": float(some.mean()), f"{name}_median": float(np.median(some))}
     return out
-
-
-def judge(source: Path, candidates: dict[str, str], stem: Path, views: int, seed: int = 1234) -> dict:
-    """Scores by candidate. ``seed``: of the views."""
-    scores = Path(f"{stem}.judge.json")
-    options = ["--views", str(views), "--spp", "36", "--seed", str(seed), "--json", str(scores)]
-    command = [sys.executable, str(JUDGE / "evaluate.py"), str(source), *candidates.values(), *options]
-    subprocess.run(command, check=True, capture_output=True, cwd=JUDGE)
-    return dict(zip(candidates, json.loads(scores.read_text())["candidates"], strict=True))
 
 
 def run_row(asset: str, preset: str, steps: int | None, python: str | None, views: int, free: bool) -> dict:
@@ -198,9 +148,9 @@ def run_row(asset: str, preset: str, steps: int | None, python: str | None, view
         row["joint"] = {"asked": [preset, steps], **with_shape(source, low, stem, preset, steps)}
         row.pop("scores", None)
         path.write_text(json.dumps(row, indent=1))
-    if "scores" not in row:
+    if "scores" not in row or row.get("views") != views:
         names = ["closed", "fitted", *(n for n in ("blender", "joint") if n in row)]
-        row["scores"] = judge(source, {n: f"{stem}_{n}.glb" for n in names}, stem, views)
+        row.update(scores=judge(source, {n: f"{stem}_{n}.glb" for n in names}, stem, views), views=views)
         path.write_text(json.dumps(row, indent=1))
     return row
 
@@ -263,8 +213,7 @@ def main() -> None:
         found = [OUT / f"{n}.json" for n in names]
         print(tables([r for p in found if p.exists() for r in [json.loads(p.read_text())] if "scores" in r]))
         return
-    if not JUDGE.exists():
-        sys.exit(f"{JUDGE} is not there: this experiment needs the neutral renderer and its references")
+    needs_judge()
     print(tables([run_row(n, a.preset, a.steps, a.blender, a.views, a.joint) for n in names]))
 
 

@@ -21,8 +21,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from experiments.baking.__main__ import OUT as FOLDER
-from experiments.baking.__main__ import ROWS, make_low
+from experiments.baking.pairs import OUT as FOLDER
+from experiments.baking.pairs import ROWS, make_low
 from experiments.common import Kept, source_of
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from experiments.baking.__main__ import OUT, ROWS, make_low
+from experiments.baking.pairs import OUT, ROWS, make_low
 from experiments.common import isolated, source_of
 
 BAKE = """

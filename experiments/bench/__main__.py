@@ -111,7 +111,9 @@ def run_case(
             target = Targets(source.render_device(v.records(), grid, 1))
         background = np.full((4, 3), 0.3, np.float32)
         inputs = StepInputs(v, target, background, 0.01, 1.0, k, want_loss=k % LOSS_EVERY == 0)
-        step(gradients, moments, inputs, first_non_finite)
+        done = step(gradients, moments, inputs, first_non_finite)
+        model.restore(done.values)
+        moments.update(done.moments)
 
     return {
         **timings(one, steps, at_once),

@@ -4,7 +4,9 @@
     python -m experiments.convergence --rows sphere decimated:pairs --seconds 5 --out out/try
     python -m experiments.convergence --plot                # picture and tables from what was measured
 
-Each fit is one row of out/convergence/curves.csv per look at the held-out views; a rerun skips fits that are there.
+Each fit is one row of out/convergence/curves.csv per look at the held-out views; a rerun skips fits of the same length
+that are there, and picture and tables are of the fits of ``--seconds``. Needs spot and flight_helmet in
+``../shared/assets``.
 Images of the reference are rendered, and kernels compiled, before the clock starts.
 """
 
@@ -19,7 +21,7 @@ from pathlib import Path
 from appearance_opt import backend
 from appearance_opt.fit.loop import fit
 from appearance_opt.render.gradient import Quality
-from experiments.convergence.cases import Case, make_case, names
+from experiments.convergence.cases import Case, make_case, names, source
 from experiments.convergence.plot import draw
 
 OUT = Path("out/convergence")
@@ -49,15 +51,17 @@ def main() -> None:
     arguments = parser.parse_args()
     path = arguments.out / "curves.csv"
     if not arguments.plot:
+        for name in names():  # before any fit
+            source(name)
         backend.select("cpu")
         for seed in range(arguments.seeds):
             for name in names():
                 wanted = [e for e in ESTIMATORS if name in arguments.rows or f"{name}:{e}" in arguments.rows]
-                there = {(r["case"], r["estimator"], int(r["seed"])) for r in rows_of(path)}
+                there = {(r["case"], r["estimator"], int(r["seed"])) for r in lasting(rows_of(path), arguments.seconds)}
                 missing = [e for e in wanted if (name, e, seed) not in there]
                 if missing:
                     run(make_case(name, seed), missing, seed, arguments.seconds, path)
-    draw(path)
+    draw(path, lasting(rows_of(path), arguments.seconds))
 
 
 def run(case: Case, estimators: list[str], seed: int, seconds: float, path: Path) -> None:
@@ -79,6 +83,11 @@ def rows_of(path: Path) -> list[dict[str, str]]:
         return []
     with path.open() as file:
         return list(csv.DictReader(file))
+
+
+def lasting(rows: list[dict[str, str]], seconds: float) -> list[dict[str, str]]:
+    """Those of fits of that length."""
+    return [r for r in rows if abs(float(r["budget"]) - seconds) < 1e-3]
 
 
 def keep(path: Path, rows: list[tuple]) -> None:

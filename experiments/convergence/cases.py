@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,10 +21,11 @@ from appearance_opt.jobs.start import Start, make_start
 from appearance_opt.reference.mesh import MeshReference
 from appearance_opt.reference.pool import ReferencePool
 from appearance_opt.views import ViewSampler
-from experiments.common import Framed
+from experiments.common import Framed, asset
 
-ASSETS = Path(__file__).resolve().parents[3] / "shared" / "assets"
-SPOT, HELMET = ASSETS / "spot" / "spot.obj", ASSETS / "flight_helmet" / "FlightHelmet.gltf"
+if TYPE_CHECKING:
+    from pathlib import Path
+
 TEXTURE = 512
 LOOKED_AT = 128
 """Resolution of the held-out views: 9 rays in each pixel."""
@@ -45,9 +46,14 @@ def names() -> list[str]:
     return ["sphere", "decimated", "sub-pixel"]
 
 
+def source(name: str) -> Path:
+    """The reference of the case of that name. Raises ``common.Missing``."""
+    return asset("spot/spot.obj" if name == "sphere" else "flight_helmet/FlightHelmet.gltf")
+
+
 def make_case(name: str, seed: int) -> Case:
     """The case of that name, its reference rendered. ``seed``: of views, backgrounds and random maps."""
-    framed = Framed(load(SPOT if name == "sphere" else HELMET), seed)
+    framed = Framed(load(source(name)), seed)
     make = {"sphere": _from_sphere, "decimated": _decimated, "sub-pixel": _sub_pixel}[name]
     case = make(framed.reference, framed.sampler, seed)
     for group in range(case.pool.capacity // case.pool.batch):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import csv
-import shutil
+import sys
 from pathlib import Path
 
 import matplotlib
@@ -20,15 +20,19 @@ COLOURS = {
 }
 
 
-def draw(path: Path) -> None:
-    """``curves.csv`` -> a table beside it; picture and CSV into docs/images if it lies where they come from."""
-    with path.open() as file:
-        rows = list(csv.DictReader(file))
+def draw(path: Path, rows: list[dict[str, str]]) -> None:
+    """Rows of ``path``, all of one length -> a table beside it; picture and CSV into docs/images if it lies where they
+    come from. Ends the program with one line if there are none."""
+    if not rows:
+        sys.exit(f"no fit of that length in {path}: run the experiment first")
     path.with_suffix(".md").write_text(table(rows))
     kept = path.parent == Path("out/convergence")
     picture(rows, IMAGES / "convergence.png" if kept else path.with_suffix(".png"))
     if kept:
-        shutil.copyfile(path, IMAGES / "convergence.csv")
+        with (IMAGES / "convergence.csv").open("w", newline="") as file:
+            writer = csv.DictWriter(file, list(rows[0]))
+            writer.writeheader()
+            writer.writerows(rows)
 
 
 def table(rows: list[dict[str, str]]) -> str:

@@ -1,13 +1,15 @@
 """Time per step and peak memory by tessellation level, each in a fresh process.
 
-    python -m experiments.displacement.growth [1000:0 1000:3 1000:4 4000:4]
+    python -m experiments.displacement.growth [CASE ...]
 
-A sphere with all maps fitted (512^2), 4 views of 256 x 256, no reference: what the latent costs by itself. One step
-is forward, loss, backward with the Laplacian, and the BVH. CPU time is that of all threads together.
+A CASE is base triangles and level, as 1000:3. A sphere with all maps fitted (512^2), 4 views of 256 x 256, no
+reference: what the latent costs by itself. One step is forward, loss, backward with the Laplacian, and the BVH. CPU
+time is that of all threads together.
 """
 
 from __future__ import annotations
 
+import argparse
 import resource
 import subprocess
 import sys
@@ -59,12 +61,16 @@ def measure(triangles: int, level: int) -> str:
 
 
 def main() -> None:
-    if len(sys.argv) == 3 and ":" not in sys.argv[1]:
-        print(measure(int(sys.argv[1]), int(sys.argv[2])))
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("cases", nargs="*", default=list(CASES), metavar="CASE")
+    parser.add_argument("--here", action="store_true", help="measure the only case in this process")
+    a = parser.parse_args()
+    if a.here:
+        print(measure(*(int(n) for n in a.cases[0].split(":"))))
         return
     print("| base triangles | level | drawn | CPU ms per step | peak GiB |\n|---|---|---|---|---|", flush=True)
-    for case in sys.argv[1:] or CASES:
-        subprocess.run([sys.executable, "-m", "experiments.displacement.growth", *case.split(":")], check=True)
+    for case in a.cases:
+        subprocess.run([sys.executable, "-m", "experiments.displacement.growth", "--here", case], check=True)
 
 
 if __name__ == "__main__":

@@ -3,21 +3,20 @@
     python -m experiments.quality [--preset default] [--rows spot:1404,...] [--views 24]
 
 Needs the folder ``../shared/judge`` (a renderer that is not ours, reference GLBs and the other tools' scores in
-``peers.json``). Results are appended to ``out/quality/<preset>.json``, one row at a time, so that a broken run
-goes on where it stopped; ``--table`` prints the table for docs/quality.md from what is there.
+``peers.json``). Results are kept in ``out/quality/<preset>.json``, one row at a time, so that a broken run
+goes on where it stopped; a row of other views is another row. ``--table`` prints the table for docs/quality.md from
+what is there.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import subprocess
-import sys
-from pathlib import Path
 
-ROOT = Path(__file__).resolve().parents[2]
-JUDGE = ROOT.parent / "shared" / "judge"
-OUT = ROOT / "out" / "quality"
+from experiments.common import JUDGE, Kept, isolated, judge, needs_judge, source_of
+from experiments.common import OUT as RESULTS
+
+OUT = RESULTS / "quality"
 ROWS = (
     ("spot", "0.05", 4684),
     ("spot", "0.015", 1404),
@@ -27,29 +26,23 @@ ROWS = (
     ("flight_helmet", "0.015", 1367),
 )
 METRICS = ("psnr_cov", "flip", "sil_shift_px")
+SIMPLIFY = """
+import json, sys
+import appearance_opt as a
+o = a.simplify_options(sys.argv[4], triangles=int(sys.argv[3]))
+r = a.simplify(sys.argv[1], sys.argv[2] + ".glb", o, report=sys.argv[2] + ".report")
+a.save(r.start, sys.argv[2] + "_start.glb")
+print(json.dumps({"seconds": r.seconds, "steps": r.fit.steps, "best": r.fit.best_step}))
+"""
 
 
 def run_row(asset: str, triangles: int, preset: str, views: int) -> dict:
     """Simplify one asset in a fresh process and judge its start and its result."""
     OUT.mkdir(parents=True, exist_ok=True)
-    reference = JUDGE / "references" / f"{asset}.glb"
-    stem = OUT / f"{asset}_{triangles}_{preset}"
-    code = (
-        "import json, sys, appearance_opt as a;"
-        "o = a.simplify_options(sys.argv[4], triangles=int(sys.argv[3]));"
-        "r = a.simplify(sys.argv[1], sys.argv[2] + '.glb', o, report=sys.argv[2] + '.report');"
-        "a.save(r.start, sys.argv[2] + '_start.glb');"
-        "print(json.dumps({'seconds': r.seconds, 'steps': r.fit.steps, 'best': r.fit.best_step}))"
-    )
-    arguments = [sys.executable, "-c", code, str(reference), str(stem), str(triangles), preset]
-    job = subprocess.run(arguments, check=True, capture_output=True, text=True)
-    scores = stem.with_suffix(".judge.json")
-    judged = [f"{stem}_start.glb", f"{stem}.glb"]
-    options = ["--views", str(views), "--spp", "36", "--json", str(scores), "--dump", str(OUT / "pictures")]
-    command = [sys.executable, str(JUDGE / "evaluate.py"), str(reference), *judged, *options]
-    subprocess.run(command, check=True, capture_output=True, cwd=JUDGE)
-    start, result = json.loads(scores.read_text())["candidates"]
-    return {"asset": asset, "triangles": triangles, "start": start, "result": result, **json.loads(job.stdout)}
+    reference, stem = source_of(asset), OUT / f"{asset}_{triangles}_{preset}"
+    job = isolated(SIMPLIFY, str(reference), str(stem), str(triangles), preset)
+    files = {"start": f"{stem}_start.glb", "result": f"{stem}.glb"}
+    return {**judge(reference, files, stem, views, pictures=OUT / "pictures"), **job}
 
 
 def best_tool(asset: str, ratio: str) -> dict:
@@ -90,20 +83,17 @@ def main() -> None:
     parser.add_argument("--views", type=int, default=24)
     parser.add_argument("--table", action="store_true")
     a = parser.parse_args()
-    path = OUT / f"{a.preset}.json"
-    rows = json.loads(path.read_text()) if path.exists() else []
+    kept = Kept(OUT / f"{a.preset}.json")
+    asked = {"preset": a.preset, "views": a.views}
     if not a.table:
-        if not JUDGE.exists():
-            sys.exit(f"{JUDGE} is not there: this experiment needs the neutral renderer and its references")
+        needs_judge()
         wanted = {tuple(r.split(":")) for r in a.rows.split(",") if r}
-        done = {(r["asset"], r["triangles"]) for r in rows}
         for asset, _, triangles in ROWS:
-            if (asset, triangles) in done or (wanted and (asset, str(triangles)) not in wanted):
-                continue
-            rows.append(run_row(asset, triangles, a.preset, a.views))
-            path.write_text(json.dumps(rows, indent=1))
-            print(table(rows[-1:]).splitlines()[2], flush=True)
-    print(table(rows))
+            if not wanted or (asset, str(triangles)) in wanted:
+                key = {"asset": asset, "triangles": triangles, **asked}
+                row = kept.row(key, lambda n=asset, t=triangles: run_row(n, t, a.preset, a.views))
+                print(table([row]).splitlines()[2], flush=True)
+    print(table(kept.of(asked)))
 
 
 if __name__ == "__main__":

@@ -21,10 +21,12 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments.baking.__main__ import SIZE, judge, maps_of_blender
-from experiments.quality.__main__ import JUDGE, OUT, ROOT, ROWS
+from experiments.baking.pairs import SIZE, maps_of_blender
+from experiments.common import OUT, judge, needs_judge, source_of
+from experiments.quality.__main__ import OUT as QUALITY
+from experiments.quality.__main__ import ROWS
 
-FOLDER = ROOT / "out" / "drop"
+FOLDER = OUT / "drop"
 VIEWS, FIRST_SEED = 24, 1234
 """Views of a set, and the neutral renderer's seed for the first one."""
 
@@ -57,15 +59,17 @@ def run_row(python: str, asset: str, triangles: int, seeds: int) -> dict:
     from appearance_opt import compare
 
     FOLDER.mkdir(parents=True, exist_ok=True)
-    reference = JUDGE / "references" / f"{asset}.glb"
+    reference, ours = source_of(asset), QUALITY / f"{asset}_{triangles}_default.glb"
+    if not ours.is_file():
+        sys.exit(f"{ours} is not there: run python -m experiments.quality first")
     stem = FOLDER / f"{asset}_{triangles}"
     candidates = {
-        "ours": str(OUT / f"{asset}_{triangles}_default.glb"),
+        "ours": str(ours),
         "blender": str(blender_result(python, reference, triangles, stem)),
     }
     row: dict = {"asset": asset, "triangles": triangles} | {n: {"compare": [], "judge": []} for n in candidates}
     for k in range(seeds):
-        judged = judge(reference, candidates, stem, VIEWS, FIRST_SEED + k)
+        judged = judge(reference, candidates, stem, VIEWS, seed=FIRST_SEED + k)
         for name, path in candidates.items():
             row[name]["judge"].append(judged[name]["psnr_cov"])
             row[name]["compare"].append(compare(reference, path, views=VIEWS, seed=k).metrics.psnr_covered)
@@ -90,8 +94,7 @@ def main() -> None:
     parser.add_argument("--rows", default="spot:1404,chess_king:2432,flight_helmet:1367")
     parser.add_argument("--seeds", type=int, default=1)
     a = parser.parse_args()
-    if not JUDGE.exists():
-        sys.exit(f"{JUDGE} is not there: this experiment needs the neutral renderer and its references")
+    needs_judge()
     wanted = {tuple(r.split(":")) for r in a.rows.split(",")}
     print("| asset, triangles | ours: compare, judge, drop (dB) | Blender: compare, judge, drop (dB) | more |")
     print("|---|---|---|---|")

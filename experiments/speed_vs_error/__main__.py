@@ -1,6 +1,6 @@
 """Speed against error: every lever of a fit on its own, and whole jobs, PSNR and FLIP against wall-clock time.
 
-    python -m experiments.speed_vs_error [--scenes ...] [--levers ...] [--seconds 15] [--jobs ...]
+    python -m experiments.speed_vs_error [--scenes ...] [--levers ...] [--seconds 12] [--jobs ...]
     python -m experiments.speed_vs_error --levers reference --seconds 50 --jobs none --scenes "chess_king"
     python -m experiments.speed_vs_error --write-docs
 
@@ -20,7 +20,7 @@ import sys
 import time
 from pathlib import Path
 
-from experiments.common import ROOT
+from experiments.common import ROOT, Missing
 from experiments.speed_vs_error import plots, tables
 from experiments.speed_vs_error.results import CurveRow, JobRow, read, scores, write
 from experiments.speed_vs_error.runner import Point, run
@@ -52,7 +52,7 @@ def _arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scenes", default="", help=f"some of: {'; '.join(s.name for s in SUBJECTS)} (separated by ;)")
     parser.add_argument("--levers", default="core", help="core, reference, all, none, or names separated by ;")
-    parser.add_argument("--seconds", type=float, default=15.0, help="length of each fit [15]")
+    parser.add_argument("--seconds", type=float, default=12.0, help="length of each fit [12]")
     parser.add_argument("--jobs", default="all", help="all, none, or names of whole jobs separated by ;")
     parser.add_argument("--write-docs", action="store_true", help="pictures and tables into docs/, no measuring")
     return parser.parse_args()
@@ -85,8 +85,8 @@ def _levers(text: str) -> list[Lever]:
 def _is_there(subject: Subject) -> bool:
     try:
         subject.path()
-    except FileNotFoundError as missing:
-        print(f"{subject.name}: {missing} is not there, left out", flush=True)
+    except Missing as missing:
+        print(f"{subject.name} is left out: {missing}", flush=True)
         return False
     return True
 

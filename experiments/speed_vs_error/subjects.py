@@ -60,12 +60,8 @@ class Subject:
         return ["--ratio", str(self.ratio)]
 
     def path(self) -> Path:
-        """The file; the embedded scene is written when first asked for. FileNotFoundError where an asset is not
-        there."""
-        path = source_of(self.source)
-        if not path.is_file():
-            raise FileNotFoundError(path)
-        return path
+        """The file; the embedded scene is written when first asked for. Raises ``common.Missing``."""
+        return source_of(self.source)
 
 
 SUBJECTS = (
