@@ -98,7 +98,7 @@ def install_hint() -> str:
 
 def available_memory() -> int | None:
     """Bytes of memory that a process may still take, or None where the system does not say. Limits of a
-    container count."""
+    container (cgroup v2) count; what it holds as a cache of files does not, as that gives way."""
     free = None
     try:
         lines = Path("/proc/meminfo").read_text().splitlines()
@@ -110,7 +110,9 @@ def available_memory() -> int | None:
     try:
         group = Path("/sys/fs/cgroup")
         limit = int((group / "memory.max").read_text()) - int((group / "memory.current").read_text())
-    except (OSError, ValueError):  # no limit, or another system
+        held = dict(line.split() for line in (group / "memory.stat").read_text().splitlines())
+        limit += int(held["inactive_file"])
+    except (OSError, ValueError, KeyError):  # no limit, or another system
         return free
     return min(free, max(limit, 0))
 

@@ -16,10 +16,11 @@ from appearance_opt.asset.types import Asset
 from appearance_opt.config import SimplifyOptions, simplify_options
 from appearance_opt.errors import DivergedError, InputError, ReferenceRenderError
 from appearance_opt.fit import loop
-from appearance_opt.fit.checkpoint import Checkpointer
+from appearance_opt.fit.checkpoint import Checkpointer, FitState
 from appearance_opt.fit.loop import FitOptions, fit
 from appearance_opt.fit.model import POSITIONS, TEXELS, Model, Rates
 from appearance_opt.fit.schedule import laplacian_weight
+from appearance_opt.fit.step import Gradients, StepInputs
 from appearance_opt.fit.validation import Validation
 from appearance_opt.initial.sphere import random_maps, sphere
 from appearance_opt.jobs.fitting import effort
@@ -132,13 +133,75 @@ def test_repeated_bad_gradients_stop_the_fit(ball: Asset, monkeypatch: pytest.Mo
     np.testing.assert_array_equal(model.host_positions(), start)
 
 
-def test_one_bad_gradient_is_skipped_and_counted(ball: Asset) -> None:
+def test_one_bad_gradient_is_skipped_and_counted(ball: Asset, monkeypatch: pytest.MonkeyPatch) -> None:
+    model, pool, validation = make_fit(ball)
+    poisoned = iter([True, False, False])
+
+    def gradients(self: Gradients, inputs: StepInputs) -> tuple:
+        loss, grads = whole(self, inputs)
+        return loss, {n: g * np.nan if n == TEXELS and next(poisoned) else g for n, g in grads.items()}
+
+    whole = Gradients.__call__
+    monkeypatch.setattr(Gradients, "__call__", gradients)
+    result = fit(model, pool, validation, FitOptions(steps=3))
+    assert (result.steps, result.skipped) == (3, 1)
+    assert all(np.isfinite(np.array(v)).all() for v in model.values().values())
+
+
+def test_a_model_that_is_not_finite_is_named(ball: Asset) -> None:
     model, pool, validation = make_fit(ball)
     value = np.array(model.parameters[TEXELS].value)
     value[:1000] = np.nan
     model.parameters[TEXELS].value = mi.Float(value)
-    result = fit(model, pool, validation, FitOptions(steps=2))
-    assert result.skipped == 2
+    with pytest.raises(DivergedError, match="own image is not finite in held-out view"):
+        fit(model, pool, validation, FitOptions(steps=2))
+
+
+def test_an_interrupted_look_leaves_the_parameters(ball: Asset, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A look renders running means; Ctrl-C there must not make a checkpoint take them for the parameters."""
+    model, pool, validation = make_fit(ball)
+    kept: list[dict] = []
+
+    class Keep(Checkpointer):
+        def __init__(self) -> None: ...
+
+        def restore(self, model: Model, state: FitState) -> bool:
+            return False
+
+        def due(self) -> bool:
+            return False
+
+        def save(self, model: Model, state: FitState) -> None:
+            kept.append({n: (np.array(v), np.array(state.moments[n].mean)) for n, v in model.values().items()})
+
+    looks = iter([None, KeyboardInterrupt, None])
+    whole = Validation.psnr
+
+    def psnr(self: Validation, model: Model) -> float:
+        what = next(looks)
+        if what is not None:
+            raise what
+        return whole(self, model)
+
+    monkeypatch.setattr(Validation, "psnr", psnr)
+    result = fit(model, pool, validation, FitOptions(steps=8, validate_every=0.5), checkpointer=Keep())
+    assert result.interrupted and result.steps == 4
+    value, mean = kept[-1][TEXELS]
+    assert np.abs(value - mean).max() > 1e-4
+
+
+def test_a_fit_without_an_end_is_refused() -> None:
+    with pytest.raises(ValueError, match="needs an end"):
+        FitOptions()
+
+
+def test_a_reference_of_another_shape_is_named(ball: Asset) -> None:
+    class Square:
+        def render(self, views, resolution: int, samples: int = 1) -> np.ndarray:
+            return np.zeros((len(views), resolution, resolution, 3), np.float32)
+
+    with pytest.raises(ReferenceRenderError, match=r"shape \(4, 16, 16, 3\).*expected \(4, 16, 16, 4\)"):
+        ReferencePool(Square(), SAMPLER, 8, 4, 16, 1).draw(0)
 
 
 def test_a_bad_reference_is_named(ball: Asset) -> None:

@@ -16,7 +16,7 @@ from appearance_opt.fit.laplacian import Laplacian
 from appearance_opt.fit.losses import loss_of_name
 from appearance_opt.fit.model import POSITIONS, Model
 from appearance_opt.fit.schedule import Clock, laplacian_weight, learning_rate
-from appearance_opt.fit.step import Gradients, StepInputs, first_non_finite, step
+from appearance_opt.fit.step import Gradients, StepInputs, StepResult, first_non_finite, step
 from appearance_opt.fit.validation import Validation
 from appearance_opt.latent.displacement import DISPLACEMENT
 from appearance_opt.latent.latent import local_edge_length
@@ -45,10 +45,12 @@ Background = str | tuple[float, float, float]
 
 @dataclass(frozen=True)
 class FitOptions:
-    """How to fit. ``steps``/``seconds``: when to stop (at least one). ``laplacian``: weight relative to
-    the first image loss, at a deviation of a tenth of an edge length (0: none). ``relative``: hold the
-    Laplacian of the start rather than 0. ``decay``: powers of ten by which the rates fall over the fit.
-    ``validate_every``: fraction of the fit between looks at the held-out views."""
+    """How to fit. ``steps``/``seconds``: when to stop (at least one, or ValueError). ``loss``: a name of
+    ``losses.LOSSES``. ``laplacian``: weight relative to the first image loss, at a deviation of a tenth of an edge
+    length (0: none). ``relative``: hold the Laplacian of the start rather than 0. ``decay``: powers of ten by which
+    the rates fall over the fit. ``background``: behind latent and reference. ``quality``: how the latent is sampled;
+    its point width is the pool's. ``validate_every``: fraction of the fit between looks at the held-out views.
+    ``seed``: of backgrounds, tessellation levels and silhouette points; views have the sampler's."""
 
     steps: int | None = None
     seconds: float | None = None
@@ -60,6 +62,10 @@ class FitOptions:
     quality: Quality = field(default_factory=Quality)
     validate_every: float = 0.125
     seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.steps is None and self.seconds is None:
+            raise ValueError("a fit needs an end: steps, seconds, or both")
 
 
 @dataclass(frozen=True)
@@ -111,7 +117,7 @@ def fit(
     except KeyboardInterrupt:
         log.warning("interrupted at step %d: the best state so far is kept", run.state.iteration)
         run.result.interrupted = True
-        model.update_scene()  # the step that was interrupted may have moved vertices already
+        model.update_scene()  # the step that was interrupted may have moved the parameters, but not yet the mesh
     except DivergedError:
         run.finish(look=False)
         raise
@@ -164,8 +170,8 @@ class _Run:
             background=backgrounds(options.background, len(views), options.seed, state.iteration),
             laplacian_weight=laplacian_weight(state.laplacian, fraction),
             rate=learning_rate(fraction, options.decay),
-            seed=state.iteration,
-            want_loss=state.iteration % LOSS_EVERY == 0 or state.laplacian == 0,
+            seed=seed_of(options.seed, state.iteration),
+            want_loss=state.iteration % LOSS_EVERY == 0 or (bool(self.laplacians) and state.laplacian == 0),
         )
         done = step(self.gradients, state.moments, inputs, first_non_finite)
         self._count(done.bad)
@@ -174,7 +180,7 @@ class _Run:
             if state.laplacian == 0 and self.model.level in self.laplacians:
                 # a deviation of a tenth of an edge length costs this fraction of the first image loss
                 state.laplacian = options.laplacian * done.loss / 0.01
-        state.iteration += 1
+        self._commit(done)
         if self.clock.progress(state.iteration) >= self.next_look and not self.clock.done(state.iteration):
             self._look_and_pause()
         self._report()
@@ -195,14 +201,16 @@ class _Run:
         state = self.state
         current = self.model.values()
         means = {name: moments.mean for name, moments in state.moments.items()}
-        self.model.restore(means)
-        self.psnr = self.validation.psnr(self.model)
+        try:
+            self.model.restore(means)
+            self.psnr = self.validation.psnr(self.model)
+        finally:  # an interrupted look must not leave the means where a checkpoint takes them for the parameters
+            self.model.restore(current)
         point = CurvePoint(self.clock.time(), state.iteration, self.psnr, state.loss)
         if not self.result.curve or self.result.curve[-1].step != state.iteration:
             self.result.curve.append(point)
         if state.best is None or self.psnr > state.best_psnr:
             state.best, state.best_psnr, state.best_iteration = means, self.psnr, state.iteration
-        self.model.restore(current)
 
     def finish(self, look: bool) -> None:
         """A last look, then back to the best state."""
@@ -223,6 +231,16 @@ class _Run:
         self.state.curve = [(p.seconds, p.step, p.psnr, p.loss) for p in self.result.curve]
         if self.checkpointer is not None:
             self.checkpointer.save(self.model, self.state)
+
+    def _commit(self, done: StepResult) -> None:
+        """Take the step, or only count it if its gradient was bad. Values, moments and iteration change together,
+        before anything slow."""
+        for name, value in done.values.items():
+            self.model.parameters[name].value = value
+        self.state.moments.update(done.moments)
+        self.state.iteration += 1
+        if done.values:
+            self.model.update_scene()
 
     def _count(self, bad: str | None) -> None:
         if bad is None:
@@ -247,6 +265,11 @@ class _Run:
         self.progress.update(
             state.iteration, fraction, state.loss, self.psnr, state.iteration / max(seconds, 1e-9), left
         )
+
+
+def seed_of(seed: int, iteration: int) -> int:
+    """Seed of an iteration's silhouette points: 32 bits, the same whenever it is replayed."""
+    return int(np.random.default_rng([seed, 17, iteration]).integers(2**32))
 
 
 def level_of(levels: tuple[int, ...], seed: int, iteration: int) -> int:

@@ -47,10 +47,12 @@ class StepInputs:
 @dataclass(frozen=True)
 class StepResult:
     """``loss``: mean image loss, or None when it was not wanted. ``bad``: name of the parameter whose gradient
-    was not finite (nothing was changed then), or None."""
+    was not finite, or None. ``values`` and ``moments`` after the step, by parameter; both empty if one was bad."""
 
     loss: float | None
     bad: str | None
+    values: dict[str, mi.Float]
+    moments: dict[str, adam.Moments]
 
 
 class Gradients:
@@ -87,9 +89,10 @@ class Gradients:
         frame = gradient.render(
             model.scene, surface, model.maps(layer), edges, records, grid, self.quality, inputs.seed, True, run
         )
-        # only pixels that are averaged have a gradient here; the value of the loss needs all
+        # Only averaged pixels have a gradient here. Of one ray per pixel these are the crossed ones; of several rays
+        # also those that are covered in part without being crossed. The value of the loss needs all pixels.
         some = frame.crossed
-        if inputs.want_loss or frame.deferred is None:
+        if inputs.want_loss or frame.deferred is None or self.quality.samples > 1:
             some = compared_pixels(frame.image, target, frame.complete())
         averaged, by_image = None, dr.zeros(mi.Float, 4 * grid.pixels)
         if some is not None and dr.width(some):
@@ -163,15 +166,15 @@ def step(
     inputs: StepInputs,
     check: Callable[[dict[str, mi.Float]], str | None],
 ) -> StepResult:
-    """Advance every parameter once. Nothing moves when ``check`` names a bad gradient."""
-    model = gradients.model
+    """Where one step takes every parameter; nothing is moved here, so that an interruption leaves no half a step.
+    ``check`` names a bad gradient."""
     value, grads = gradients(inputs)
     bad = check(grads)
+    values, after = {}, {}
     if bad is None:
-        for name, parameter in model.parameters.items():
-            parameter.value, moments[name] = adam.update(parameter, grads[name], moments[name], inputs.rate)
-        model.update_scene()
-    return StepResult(None if value is None else float(value[0]), bad)
+        for name, parameter in gradients.model.parameters.items():
+            values[name], after[name] = adam.update(parameter, grads[name], moments[name], inputs.rate)
+    return StepResult(None if value is None else float(value[0]), bad, values, after)
 
 
 def first_non_finite(grads: dict[str, mi.Float]) -> str | None:

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from appearance_opt.errors import DivergedError
 from appearance_opt.reference.pool import checked
 from appearance_opt.render.deferred import Grid, render_image
 from appearance_opt.render.display import display
@@ -24,7 +25,7 @@ class Validation:
     def __init__(self, reference: Reference, views: Views, resolution: int, samples: int = 9) -> None:
         self.views, self.resolution, self.samples = views, resolution, samples
         self._grid = Grid(len(views), resolution)
-        images = checked(reference.render(views, resolution, samples), "held-out views")
+        images = checked(reference.render(views, resolution, samples), len(views), resolution, "held-out views")
         self._reference = display(images)
         self._covered = images[..., 3] > 0
 
@@ -37,17 +38,23 @@ class Validation:
 
     def psnr(self, model: Model) -> float:
         """Mean over the views of the PSNR in dB of display values (sRGB, clipped) over the pixels that
-        either image covers; with several tessellation levels also over those."""
+        either image covers; with several tessellation levels also over those. Raises DivergedError if the model's
+        own image is not finite."""
         current = model.level
         each = []
-        for level in model.levels:
-            model.select(level)
-            each.append(self._psnr(model))
-        model.select(current)
+        try:
+            for level in model.levels:
+                model.select(level)
+                each.append(self._psnr(model))
+        finally:
+            model.select(current)
         return float(np.mean(each))
 
     def _psnr(self, model: Model) -> float:
         image = self.render(model)
+        finite = np.isfinite(image).all(axis=(1, 2, 3))
+        if not finite.all():
+            raise DivergedError(f"the fitted model's own image is not finite in held-out view {int(finite.argmin())}")
         error = np.mean((display(image) - self._reference) ** 2, axis=-1)
         either = self._covered | (image[..., 3] > 0)
         each = [e[m].mean() if m.any() else 1e-10 for e, m in zip(error, either, strict=True)]

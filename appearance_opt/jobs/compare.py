@@ -88,4 +88,4 @@ def render_asset(asset: Asset, views: Views, resolution: int, samples: int) -> N
     from appearance_opt.reference.mesh import MeshReference
     from appearance_opt.reference.pool import checked
 
-    return checked(MeshReference(asset).render(views, resolution, samples), asset.name)
+    return checked(MeshReference(asset).render(views, resolution, samples), len(views), resolution, asset.name)

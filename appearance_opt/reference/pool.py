@@ -118,17 +118,30 @@ class ReferencePool:
                 self._views[group * self.batch + k] = views[k : k + 1]
 
     def _keep(self, kept: dict[int, NDArray[np.float16]], group: int, images: NDArray[np.float32]) -> None:
+        what = f"pool batch {group}"
+        check_shape(images, self.batch, self.resolution, what)
         # on the device: NumPy takes ten times as long to halve the precision
         radiance = to_device(images)
         if not dr.all(dr.isfinite(radiance) & (radiance >= 0)):
-            checked(images, f"pool batch {group}")
+            checked(images, self.batch, self.resolution, what)
         halved = np.array(mi.Float16(at_most(radiance, LARGEST_HALF)))
         kept.update(enumerate(halved.reshape(self.batch, -1), group * self.batch))
 
 
-def checked(images: NDArray[np.float32], what: str) -> NDArray[np.float32]:
-    """The images, if every pixel is finite and not negative; ReferenceRenderError naming the first view
-    that is not."""
+def check_shape(images: NDArray[np.float32], count: int, resolution: int, what: str) -> None:
+    """Raises ReferenceRenderError unless there are ``count`` square images of four channels."""
+    wanted = (count, resolution, resolution, 4)
+    if np.shape(images) != wanted:
+        raise ReferenceRenderError(
+            f"the reference renderer returned an array of shape {np.shape(images)} ({what}); expected {wanted}: views, "
+            "rows, columns, and premultiplied linear RGB with coverage"
+        )
+
+
+def checked(images: NDArray[np.float32], count: int, resolution: int, what: str) -> NDArray[np.float32]:
+    """The images, if there are ``count`` of them and every pixel is finite and not negative; ReferenceRenderError
+    naming the first view that is not."""
+    check_shape(images, count, resolution, what)
     ok = np.isfinite(images) & (images >= 0)
     if ok.all():
         return images

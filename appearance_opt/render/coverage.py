@@ -4,7 +4,9 @@ The derivative of a loss is only as good as the image it is taken at, and a few 
 covered area of a pixel badly. The silhouette points know the line that bounds it. The area on its inner side is
 known in closed form, and so is the share of the pixel's rays that lies there: their difference, times the
 contrast across the line, is what the rays missed (a control variate). It has no bias for any line, so that
-a pixel with several silhouettes, or a bent one, is no worse off than with the rays alone.
+a pixel with several silhouettes, or a bent one, is no worse off than with the rays alone. Only where the sum leaves
+what an image can be (negative radiance, coverage outside of [0, 1]) is it brought back, which is always nearer to the
+truth.
 """
 
 from __future__ import annotations
@@ -15,7 +17,7 @@ import drjit as dr
 import mitsuba as mi
 
 from appearance_opt.render import rays
-from appearance_opt.render.math import at_least
+from appearance_opt.render.math import at_least, at_most
 
 if TYPE_CHECKING:
     from appearance_opt.render.silhouette import EdgeSamples
@@ -57,5 +59,6 @@ def correction(edges: EdgeSamples, contrast: mi.ArrayXf, pixels: int, samples: i
 
 
 def corrected(image: mi.Float, missed: mi.Float) -> mi.Float:
-    """The image with what its rays missed; no radiance becomes negative."""
-    return at_least(image + missed, 0)
+    """The image (pixels * 4) with what its rays missed: no radiance below 0, no coverage outside of [0, 1]."""
+    is_coverage = (dr.arange(mi.UInt32, dr.width(image)) & 3) == 3
+    return at_most(at_least(image + missed, 0), dr.select(is_coverage, mi.Float(1), mi.Float(dr.inf)))

@@ -3,7 +3,7 @@
 Dr.Jit's ``maximum``/``minimum``/``clip`` propagate NaNs through an LLVM intrinsic that x86 has only since
 LLVM 17; older libraries, which current long-term distributions still ship, abort the whole process on
 it. These are built on the NaN-ignoring ``fmax``/``fmin``, which every version compiles. A NaN is caught
-where it is born: in the image and in the gradients (see ``fit``), not here.
+where it shows: in the gradients of every step and in the held-out images (see ``fit``), not here.
 """
 
 from __future__ import annotations

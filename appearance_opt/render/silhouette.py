@@ -9,7 +9,7 @@ differentiation of the shading finds, an integral along the visible silhouettes,
 with x the point of the projected edge, n its outward normal in the image, c_in and c_out the colours on
 its two sides. Edges are found from the mesh alone, sampled uniformly by projected length, and tested for
 visibility by the two rays that also give the colours. Unbiased, but for self-intersections of the
-mesh, which have no edge.
+mesh, which have no edge, and for edges that come too near to the camera or leave the image by far (``_candidates``).
 """
 
 from __future__ import annotations
@@ -41,6 +41,8 @@ DEPTH_SLACK = 0.01
 edges of grazing faces (0.002 costs 4 % bias)."""
 
 MAX_SAMPLES = 1 << 20
+"""Silhouette points of a batch before they are tested for visibility; of longer silhouettes they lie farther apart, and
+each stands for more."""
 
 
 @dataclass
@@ -197,12 +199,13 @@ def sample_edges(
     index, length = silhouette_edges(edges, vertices, records, grid.views, grid.size, run)
     if dr.width(index) == 0:
         return None
-    upper = dr.cumsum(length)
+    # in single precision the rounding of sums of 1e5 pixels is a tenth of an edge of a fine mesh
+    upper = dr.cumsum(mi.Float64(length))
     total = float(upper[dr.width(upper) - 1])
     count = min(max(int(total * density), 1), MAX_SAMPLES)
     number = dr.arange(mi.UInt32, count)
     dr.eval(number)
-    strata = Strata(index, upper, dr.opaque(mi.UInt32, dr.width(upper) - 1), dr.opaque(mi.Float, total / count))
+    strata = Strata(index, upper, dr.opaque(mi.UInt32, dr.width(upper) - 1), dr.opaque(mi.Float64, total / count))
     points, visible = run(
         _points,
         scene,
@@ -223,12 +226,12 @@ def sample_edges(
 @dataclass
 class Strata:
     """Silhouettes in a row: ``index`` of each (view * edges + edge), the length ``upper`` up to its end, the number of
-    the ``last``, and the ``spacing`` of points along them."""
+    the ``last``, and the ``spacing`` of points along them. Lengths in pixels."""
 
     index: mi.UInt32
-    upper: mi.Float
+    upper: mi.Float64
     last: mi.UInt32
-    spacing: mi.Float
+    spacing: mi.Float64
 
 
 def _points(
@@ -244,11 +247,11 @@ def _points(
     seed: mi.UInt32,
 ) -> tuple[EdgeSamples, mi.Bool]:
     """The points of the given numbers along the silhouettes, and whether each is visible."""
-    at = (mi.Float(number) + mi.sample_tea_float32(number, seed)) * strata.spacing
+    at = (mi.Float64(number) + mi.Float64(mi.sample_tea_float32(number, seed))) * strata.spacing
     found = _first_not_below(strata.upper, at, strata.last, views * edges.count)
     pair = dr.gather(mi.UInt32, strata.index, found)
-    begin = dr.gather(mi.Float, strata.upper, found - 1, found > 0)
-    s = (at - begin) / (dr.gather(mi.Float, strata.upper, found) - begin)
+    begin = dr.gather(mi.Float64, strata.upper, found - 1, found > 0)
+    s = mi.Float((at - begin) / (dr.gather(mi.Float64, strata.upper, found) - begin))
     s = dr.select((s > 0) & (s < 1), s, 0.5)
     view = pair // edges.count
     edge = pair - view * edges.count
@@ -274,17 +277,17 @@ def _points(
     # an edge with the same face (or nothing) on both sides has no contrast
     visible &= hits[0].triangle != hits[1].triangle
     pixel = (view * rows + mi.UInt32(y)) * rows + mi.UInt32(x)
-    return EdgeSamples(edge, view, s, pixel, strata.spacing, nx, ny, hits[0], hits[1]), visible
+    return EdgeSamples(edge, view, s, pixel, mi.Float(strata.spacing), nx, ny, hits[0], hits[1]), visible
 
 
-def _first_not_below(ascending: mi.Float, value: mi.Float, last: mi.UInt32, longest: int) -> mi.UInt32:
+def _first_not_below(ascending: mi.Float64, value: mi.Float64, last: mi.UInt32, longest: int) -> mi.UInt32:
     """Index of the first entry >= value (the ``last`` entry if there is none). The number of bisections
     follows from the ``longest`` possible array, so that one kernel serves all lengths."""
     found = dr.zeros(mi.UInt32, dr.width(value))
     for bit in reversed(range(longest.bit_length())):
         candidate = found + (1 << bit)
         inside = candidate <= last
-        below = dr.gather(mi.Float, ascending, candidate - 1, inside) < value
+        below = dr.gather(mi.Float64, ascending, candidate - 1, inside) < value
         found = dr.select(inside & below, candidate, found)
     return found
 
