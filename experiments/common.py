@@ -71,7 +71,7 @@ def judge(
     options = ["--views", str(views), "--spp", "36", "--seed", str(seed), "--json", str(scores)]
     options += [] if pictures is None else ["--dump", str(pictures)]
     command = [sys.executable, str(JUDGE / "evaluate.py"), str(source), *candidates.values(), *options]
-    subprocess.run(command, check=True, capture_output=True, cwd=JUDGE)
+    _output_of(command, JUDGE)
     return dict(zip(candidates, json.loads(scores.read_text())["candidates"], strict=True))
 
 
@@ -114,8 +114,12 @@ class Kept:
 
 def isolated(code: str, *arguments: str) -> dict:
     """Run a snippet in a fresh process (its time and memory are its own); its last line is JSON."""
-    command = [sys.executable, "-c", code, *arguments]
-    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT)
+    return json.loads(_output_of([sys.executable, "-c", code, *arguments], ROOT).splitlines()[-1])
+
+
+def _output_of(command: list[str], folder: Path) -> str:
+    """What a program prints. Raises RuntimeError with its last words if it fails."""
+    done = subprocess.run(command, capture_output=True, text=True, cwd=folder)
     if done.returncode:
         raise RuntimeError(done.stderr)
-    return json.loads(done.stdout.splitlines()[-1])
+    return done.stdout
