@@ -14,7 +14,13 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 RECORD = 16
-"""Floats per view on the device: eye, forward, right, down (each xyz + one light component)."""
+"""Floats per view on the device: eye, forward, right, down, each xyz and one number of the light: its position and its
+intensity."""
+
+FIT, VALIDATION, VISIBILITY, START, MEASURED = range(5)
+"""Streams of views, which share none: those that a fit draws, those by which it keeps its best state, those that tell
+what of the reference is seen, those by which a start is chosen, and those of reports and comparisons, which nothing
+was ever chosen by."""
 
 
 @dataclass(frozen=True)
@@ -103,7 +109,7 @@ class ViewSampler:
     centre: tuple[float, float, float]
     radius: float
     seed: int = 0
-    stream: int = 0
+    stream: int = FIT
     fov: float = 32.0
     hull: NDArray | None = None
     light: str = "point"
@@ -111,7 +117,7 @@ class ViewSampler:
     exposure: float = 0.85
 
     def held_out(self, stream: int) -> ViewSampler:
-        """The same distribution, other draws: views that the fit never saw."""
+        """The same distribution, other draws: another of the streams above."""
         return replace(self, stream=stream)
 
     def draw(self, iteration: int, count: int) -> Views:
@@ -133,7 +139,7 @@ class ViewSampler:
 
 
 MARGIN = 1.02
-"""Framing leaves this much room around the object."""
+"""A framed view is this many times as wide as the object."""
 
 
 def _framed(views: Views, points: NDArray) -> Views:

@@ -18,9 +18,6 @@ if TYPE_CHECKING:
     from appearance_opt.evaluate.metrics import Metrics
     from appearance_opt.views import Views, ViewSampler
 
-HELD_OUT_STREAM = 3
-"""Stream of random views that no fit draws from."""
-
 
 @dataclass
 class Comparison:
@@ -58,12 +55,12 @@ def compare(
     )
     backend.select(device)
     from appearance_opt.jobs.simplify import in_frame, support
-    from appearance_opt.views import ViewSampler, framing
+    from appearance_opt.views import MEASURED, ViewSampler, framing
 
     points = np.concatenate([m.positions for a in (first, second) for m in a.meshes])
     frame = framing(points)
     hull = support(((points.astype(np.float64) - np.array(frame[0])) / frame[1]).astype(np.float32))
-    sampler = ViewSampler((0.0, 0.0, 0.0), 1.0, seed, stream=HELD_OUT_STREAM, hull=hull)
+    sampler = ViewSampler((0.0, 0.0, 0.0), 1.0, seed, stream=MEASURED, hull=hull)
     result = compare_in_frame(in_frame(first, *frame), in_frame(second, *frame), sampler, views, resolution, samples)
     if out is not None:
         from appearance_opt.jobs.report import write_compare_report

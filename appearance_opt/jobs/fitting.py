@@ -16,6 +16,7 @@ from appearance_opt.initial.fill import fill
 from appearance_opt.latent.displacement import DISPLACEMENT
 from appearance_opt.reference.pool import ReferencePool
 from appearance_opt.render.gradient import Quality
+from appearance_opt.views import VALIDATION
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -107,7 +108,7 @@ def fit_start(
     o = options
     width = point_width(o.resolution, o.texture_size)
     pool = ReferencePool(reference, sampler, o.pool, o.views, o.resolution, POOL_SAMPLES, width, o.reuse)
-    held_out = sampler.held_out(1).draw(0, VALIDATION_VIEWS)
+    held_out = sampler.held_out(VALIDATION).draw(0, VALIDATION_VIEWS)
     validation = Validation(reference, held_out, min(o.resolution, 256))
     parts = frozenset(o.fit) | ({DISPLACEMENT} if o.displaced else set())
     model = Model(start.mesh, start.maps, parts, Rates(), start.levels)

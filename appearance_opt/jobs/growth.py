@@ -30,6 +30,7 @@ from appearance_opt.latent.export import to_asset
 from appearance_opt.latent.latent import LatentMesh
 from appearance_opt.reference.mesh import MeshReference
 from appearance_opt.reference.pool import ReferencePool
+from appearance_opt.views import VALIDATION
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -124,7 +125,7 @@ def _shaped(
     strength, rate = smoothing(len(mesh.faces))
     model.precondition(strength, pace * rate)
     pool = ReferencePool(reference, sampler, POOL, VIEWS, RESOLUTION, POOL_SAMPLES, POINT_WIDTH, options.reuse)
-    validation = Validation(reference, sampler.held_out(1).draw(0, VALIDATION_VIEWS), RESOLUTION)
+    validation = Validation(reference, sampler.held_out(VALIDATION).draw(0, VALIDATION_VIEWS), RESOLUTION)
     fit_options = FitOptions(
         steps=effort.steps,
         seconds=effort.seconds,

@@ -13,10 +13,10 @@ from appearance_opt.config import as_dict
 from appearance_opt.evaluate import pictures
 from appearance_opt.evaluate.metrics import compare_images
 from appearance_opt.evaluate.report import ReportData, write_report
-from appearance_opt.jobs.compare import HELD_OUT_STREAM, Comparison, render_asset
+from appearance_opt.jobs.compare import Comparison, render_asset
 from appearance_opt.reference.mesh import MeshReference
 from appearance_opt.render.rays import MISS, trace
-from appearance_opt.views import Views
+from appearance_opt.views import MEASURED, Views
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -64,7 +64,7 @@ def _level_metrics(
 
     if len(result.tessellated) < 2:
         return {}
-    views = sampler.held_out(HELD_OUT_STREAM).draw(0, VIEWS)
+    views = sampler.held_out(MEASURED).draw(0, VIEWS)
     reference = render_asset(in_frame(source, *frame), views, RESOLUTION, SAMPLES)
     return {
         f"level {k}": compare_images(reference, render_asset(in_frame(a, *frame), views, RESOLUTION, SAMPLES))
@@ -118,7 +118,7 @@ def _measured(
     the views). One column is left out if the two are the same."""
     from appearance_opt.jobs.simplify import in_frame
 
-    views = sampler.held_out(HELD_OUT_STREAM).draw(0, VIEWS)
+    views = sampler.held_out(MEASURED).draw(0, VIEWS)
     reference, last = (render_asset(in_frame(a, *frame), views, RESOLUTION, SAMPLES) for a in (source, result))
     first = last if start is result else render_asset(in_frame(start, *frame), views, RESOLUTION, SAMPLES)
     triangles = triangle_images(in_frame(result, *frame), views[:PICTURED], 2 * RESOLUTION)

@@ -22,6 +22,7 @@ from appearance_opt.initial.visibility import importance, pixel_counts
 from appearance_opt.jobs.displaced import REACH, displaced, flat_map, gutter, median_edge, require_memory
 from appearance_opt.latent.displacement import DISPLACEMENT
 from appearance_opt.latent.latent import LatentMesh
+from appearance_opt.views import START, VISIBILITY
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -128,12 +129,12 @@ class _Decimated:
         self, reference: MeshReference, options: SimplifyOptions, sampler: ViewSampler, triangles: int
     ) -> None:
         self.reference, self.options, self.triangles = reference, options, triangles
-        self.views = sampler.held_out(3)
+        self.views = sampler.held_out(START)
         merged = reference.merged
         count = len(merged.faces)
         self.weight, self.visible = np.ones(count), np.ones(count, bool)
         if not options.keep_hidden:
-            pixels = pixel_counts(reference.scene, count, sampler.held_out(2), VISIBILITY_VIEWS)
+            pixels = pixel_counts(reference.scene, count, sampler.held_out(VISIBILITY), VISIBILITY_VIEWS)
             self.weight, seen = importance(merged.positions, merged.faces, pixels)
             self.visible = seen if seen.sum() >= triangles else self.visible
 

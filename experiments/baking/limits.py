@@ -29,8 +29,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 RESOLUTION, SIZE = 256, 1024
-RATE = 0.004
-"""Rate of the maps, about that of a fit that starts at 30 dB."""
 
 
 def outline_share(reference: NDArray, candidate: NDArray) -> tuple[float, float, float]:
@@ -57,9 +55,9 @@ def limits(asset: str, steps: int, views: int) -> dict:
     from appearance_opt.fit.model import Model, Rates
     from appearance_opt.fit.validation import Validation
     from appearance_opt.jobs.bake import BakeJob
-    from appearance_opt.jobs.fitting import POOL_SAMPLES, Stopwatch, point_width
+    from appearance_opt.jobs.fitting import POOL_SAMPLES, Stopwatch, effort, point_width
     from appearance_opt.reference.pool import ReferencePool
-    from appearance_opt.views import Views
+    from appearance_opt.views import MEASURED, Views
 
     backend.select("cpu")
     source, low = source_of(asset), FOLDER / f"{asset}_low.glb"
@@ -68,10 +66,11 @@ def limits(asset: str, steps: int, views: int) -> dict:
         make_low(source, ROWS[asset], low)
     job = BakeJob(load(source), load(low), asset, bake_options(texture_size=SIZE), Stopwatch())
     maps = dict(bake(job.reference, job.mesh, Settings(SIZE, samples=4)).maps)
-    sampler = job.sampler.held_out(3)
+    sampler = job.sampler.held_out(MEASURED)
     drawn = Views.concatenate([sampler.draw(k, 4) for k in range(views // 4)])
-    model = Model(job.mesh, maps, frozenset({"normal", "material"}), Rates(0, RATE, RATE, RATE, 0))
+    model = Model(job.mesh, maps, frozenset({"normal", "material"}), Rates())
     exact = Validation(job.reference, drawn, RESOLUTION, 16)
+    model.set_rates(effort(exact.psnr(model), likeness=True)[1])
     images = job.reference.render(drawn, RESOLUTION, 16)
     psnr, share, bound = outline_share(images, exact.render(model))
     # the pool draws the same groups of four from the same stream: it holds these views and no other

@@ -20,7 +20,7 @@ from appearance_opt.jobs.fitting import POOL_SAMPLES, VALIDATION_VIEWS, effort, 
 from appearance_opt.jobs.start import Start, make_start
 from appearance_opt.reference.mesh import MeshReference
 from appearance_opt.reference.pool import ReferencePool
-from appearance_opt.views import ViewSampler
+from appearance_opt.views import VALIDATION, ViewSampler
 from experiments.common import Framed, asset
 
 if TYPE_CHECKING:
@@ -62,7 +62,7 @@ def make_case(name: str, seed: int) -> Case:
 
 
 def _validation(reference: MeshReference, sampler: ViewSampler) -> Validation:
-    return Validation(reference, sampler.held_out(1).draw(0, VALIDATION_VIEWS), LOOKED_AT)
+    return Validation(reference, sampler.held_out(VALIDATION).draw(0, VALIDATION_VIEWS), LOOKED_AT)
 
 
 def _from_sphere(reference: MeshReference, sampler: ViewSampler, seed: int) -> Case:

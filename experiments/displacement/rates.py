@@ -39,6 +39,7 @@ class Bench:
         from appearance_opt.jobs.fitting import point_width
         from appearance_opt.jobs.start import make_start
         from appearance_opt.reference.pool import ReferencePool
+        from appearance_opt.views import VALIDATION
 
         backend.select("cpu")
         framed = Framed(load(source_of(asset)))
@@ -47,7 +48,7 @@ class Bench:
         self.start = make_start(reference, options, sampler, TRIANGLES)
         width = point_width(RESOLUTION, options.texture_size)
         self.pool = ReferencePool(reference, sampler, POOL, options.views, RESOLUTION, 16, width)
-        self.validation = Validation(reference, sampler.held_out(1).draw(0, 8), HELD_OUT)
+        self.validation = Validation(reference, sampler.held_out(VALIDATION).draw(0, 8), HELD_OUT)
 
     def run(self, case: str, steps: int) -> dict:
         """PSNR before, in the middle and after; seconds include the first rendering of the pool's views."""

@@ -15,6 +15,7 @@ from appearance_opt.fit.model import Model, Rates
 from appearance_opt.fit.validation import Validation
 from appearance_opt.jobs.fitting import VALIDATION_VIEWS, effort
 from appearance_opt.reference.pool import ReferencePool
+from appearance_opt.views import VALIDATION
 from experiments.speed_vs_error.recorder import Blind, Recorder, Snapshot
 
 if TYPE_CHECKING:
@@ -123,7 +124,7 @@ def _fit(
 
 def _rates(bench: Bench, start: Start) -> Rates:
     """The product's rule: from how good the start is."""
-    views = bench.sampler.held_out(1).draw(0, VALIDATION_VIEWS)
+    views = bench.sampler.held_out(VALIDATION).draw(0, VALIDATION_VIEWS)
     model = Model(start.mesh, start.maps, frozenset(), Rates())
     return effort(Validation(bench.reference, views, 256).psnr(model), start.relative)[1]
 

@@ -20,6 +20,7 @@ from appearance_opt.jobs.compare import render_asset
 from appearance_opt.jobs.displaced import gutter
 from appearance_opt.jobs.simplify import in_frame
 from appearance_opt.jobs.start import Start, budget, make_start, transferred
+from appearance_opt.views import MEASURED
 from experiments import common
 from experiments.common import Framed, source_of
 
@@ -31,9 +32,6 @@ if TYPE_CHECKING:
     from appearance_opt.fit.model import Model
 
 OUT = common.OUT / "speed_vs_error"
-
-MEASURED_STREAM = 6
-"""Stream of random views that no part of a job draws from."""
 
 VIEWS, RESOLUTION, SAMPLES = 8, 256, 9
 
@@ -81,7 +79,7 @@ class Bench:
         framed = Framed(load(self._path))
         self.frame, self.asset = framed.frame, framed.asset
         self.reference, self.sampler = framed.reference, framed.sampler
-        self._views = self.sampler.held_out(MEASURED_STREAM).draw(0, VIEWS)
+        self._views = self.sampler.held_out(MEASURED).draw(0, VIEWS)
         self._starts: dict[int, Start] = {}
         self._measured: dict[tuple[int, bool], Metrics] = {}
 
