@@ -82,7 +82,7 @@ def save(asset: Asset, path: str | Path) -> None:
 
         save_gltf(asset, path)
     elif suffix == ".obj":
-        from appearance_opt.asset.obj import save_obj
+        from appearance_opt.asset.obj_write import save_obj
 
         save_obj(asset, path)
     else:

@@ -1,20 +1,18 @@
-"""Wavefront OBJ and MTL."""
+"""Wavefront OBJ to an Asset. Its materials are read by ``mtl``."""
 
 from __future__ import annotations
 
-import shlex
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from appearance_opt.asset import images
-from appearance_opt.asset.packing import pack_orm
-from appearance_opt.asset.paths import read_bytes, replacing
+from appearance_opt.asset import uv_frames
+from appearance_opt.asset.mtl import MaterialReader
+from appearance_opt.asset.paths import read_bytes
 from appearance_opt.asset.polygons import Polygons, triangulate
-from appearance_opt.asset.types import Asset, Material, Mesh, Texture
+from appearance_opt.asset.types import Asset, Material, Mesh, srgb_to_linear
 from appearance_opt.errors import InputError, MissingFileError
 
 if TYPE_CHECKING:
@@ -22,19 +20,12 @@ if TYPE_CHECKING:
 
     from appearance_opt.asset.companions import Companions
 
-_MAP_OPTIONS = {
-    "-blendu": 1, "-blendv": 1, "-boost": 1, "-mm": 2, "-o": 3, "-s": 3, "-t": 3, "-texres": 1,
-    "-clamp": 1, "-bm": 1, "-imfchan": 1, "-type": 1, "-cc": 1,
-    "-colorspace": 1,
-}  # fmt: skip
-"""Options of map statements and how many values follow them."""
-
 MAX_INDEX = 2**31 - 1
 """Largest index of a face's corner (they are kept in 32 bits)."""
 
 
-def load_obj(path: Path, companions: Companions) -> Asset:
-    """Read an OBJ file and its materials. Raises InputError."""
+def load_obj(path: Path, companions: Companions, keep_layout: bool = False) -> Asset:
+    """Read an OBJ file and its materials. ``keep_layout``: see ``asset.load``. Raises InputError."""
     path = Path(path)
     text = read_bytes(path).decode("utf-8", errors="replace").replace("\\\n", " ")
     parser = _Parser(path, companions)
@@ -43,7 +34,7 @@ def load_obj(path: Path, companions: Companions) -> Asset:
             parser.line(line)
         except (ValueError, IndexError):
             raise InputError(f"{path}, line {number}: cannot be read: '{line.strip()[:60]}'") from None
-    return parser.asset()
+    return parser.asset(keep_layout)
 
 
 class _Parser:
@@ -55,7 +46,7 @@ class _Parser:
         # by material, and by what the corners have: texture coordinates, normals
         self.polygons: dict[tuple[str, bool, bool], list[list[tuple[int, int, int]]]] = {}
         self.current = ""
-        self.materials: dict[str, Material] = {}
+        self.materials = MaterialReader(companions)
         self.companions = companions
 
     def line(self, line: str) -> None:
@@ -80,7 +71,7 @@ class _Parser:
         elif key == "mtllib":
             name = line.split(None, 1)[1].strip()
             for path in self._libraries(name):
-                self.materials.update(load_mtl(path, self.companions))
+                self.materials.read(path)
 
     def _libraries(self, names: str) -> list[Path]:
         """Files of one name, which may have spaces, or of several with spaces between them."""
@@ -111,18 +102,20 @@ class _Parser:
             raise ValueError
         return (out[0], out[1], out[2])
 
-    def asset(self) -> Asset:
+    def asset(self, keep_layout: bool) -> Asset:
         there = bool(self.uvs), bool(self.normals)
         for k, what in enumerate(("texture coordinates", "normals")):
             if not there[k] and any(key[1 + k] for key in self.polygons):
                 self.companions.note(f"faces refer to {what}, of which there are none: ignored")
         for name in dict.fromkeys(key[0] for key in self.polygons):
-            if name and name not in self.materials:
+            if name and name not in self.materials.by_name:
                 self.companions.note(f"material '{name}' is not defined: default material used")
         meshes = [
             self._mesh(name, has_uv and there[0], has_normal and there[1], polygons)
             for (name, has_uv, has_normal), polygons in self.polygons.items()
         ]
+        place = uv_frames.kept if keep_layout else uv_frames.unified
+        meshes = place(meshes, self.materials.frames, self.companions.note)
         return Asset(tuple(meshes), self.path.stem, tuple(self.companions.notes))
 
     def _mesh(self, name: str, has_uv: bool, has_normal: bool, polygons: list[list[tuple[int, int, int]]]) -> Mesh:
@@ -152,132 +145,11 @@ class _Parser:
             faces=index[corners].astype(np.int32),
             normals=_unit(np.array(normals, np.float64)) if has_normal else None,
             uvs=uvs,
-            colors=np.array([v[3:6] for v in vertices], np.float32) if has_color else None,
-            material=self.materials.get(name, Material(name=name or "material", roughness=0.8)),
+            # sRGB encoded, as Blender and MeshLab write and read them: the format itself does not say
+            colors=srgb_to_linear(np.array([v[3:6] for v in vertices], np.float32)) if has_color else None,
+            material=self.materials.by_name.get(name, Material(name=name or "material", roughness=0.8)),
             name=name or self.path.stem,
         )
-
-
-def load_mtl(path: Path, companions: Companions) -> dict[str, Material]:
-    """Materials of an MTL file by name. Phong exponents become roughness sqrt(2 / (Ns + 2))."""
-    out: dict[str, Material] = {}
-    statements: dict[str, dict[str, str]] = {}
-    current: dict[str, str] = {}
-    for line in read_bytes(path).decode("utf-8", errors="replace").splitlines():
-        words = line.split(None, 1)
-        if len(words) < 2 or words[0].startswith("#"):
-            continue
-        if words[0] == "newmtl":
-            current = statements.setdefault(words[1].strip(), {})
-        else:
-            current[words[0].lower()] = words[1].strip()
-    for name, values in statements.items():
-        try:
-            out[name] = _material(name, values, path, companions)
-        except (ValueError, IndexError):
-            raise InputError(f"{path}: a value of material '{name}' is missing or not a number") from None
-    return out
-
-
-def _material(name: str, values: dict[str, str], path: Path, companions: Companions) -> Material:
-    def numbers(key: str, default: list[float]) -> list[float]:
-        return [float(w) for w in values[key].split()[:3]] if key in values else default
-
-    def texture(*keys: str, space: str = "linear") -> Texture | None:
-        key = next((k for k in keys if k in values), None)
-        return None if key is None else companions.read(lambda: _texture(values[key], path, space, companions))
-
-    color = numbers("kd", [0.8, 0.8, 0.8])
-    color = color * 3 if len(color) == 1 else color
-    base = texture("map_kd", space="srgb")
-    shininess = numbers("ns", [1.125])[0]
-    roughness = numbers("pr", [float(np.sqrt(2 / (max(shininess, 0.0) + 2)))])[0]
-    rough_map, metal_map = texture("map_pr"), texture("map_pm")
-    if values.get("d", "1").split()[-1] not in ("1", "1.0", "1.000000") or "map_d" in values:
-        companions.note(f"material '{name}': transparency ignored, drawn opaque")
-    orm = None if rough_map is None and metal_map is None else pack_orm(rough_map, metal_map)
-    glow_map = texture("map_ke", space="srgb")
-    # without the map that says where it glows, nothing does
-    glow = [0.0] * 3 if glow_map is None and "map_ke" in values else numbers("ke", [float(glow_map is not None)] * 3)
-    return Material(
-        name=name,
-        base_color=(1.0, 1.0, 1.0) if base is not None else (color[0], color[1], color[2]),
-        roughness=1.0 if rough_map is not None else min(max(roughness, 0.0), 1.0),
-        metalness=1.0 if metal_map is not None else numbers("pm", [0.0])[0],
-        base_color_texture=base,
-        orm_texture=orm,
-        normal_texture=texture("norm", "map_kn"),
-        emission=(glow[0], glow[1], glow[2]),
-        emission_texture=glow_map,
-    )
-
-
-def _texture(statement: str, owner: Path, space: str, companions: Companions) -> Texture:
-    words = shlex.split(statement, posix=True) if '"' in statement else statement.split()
-    wrap = "repeat"
-    k = 0
-    while k < len(words) and words[k] in _MAP_OPTIONS:
-        if words[k] == "-clamp" and words[k + 1] == "on":
-            wrap = "clamp"
-        k += 1 + _MAP_OPTIONS[words[k]]
-    pixels = images.read(companions.find(" ".join(words[k:]), owner))
-    if pixels.shape[2] < 3:
-        pixels = np.repeat(pixels[..., :1], 3, axis=2)
-    return Texture(pixels, space, (wrap, wrap))  # type: ignore[arg-type]
-
-
-def save_obj(asset: Asset, path: Path) -> None:
-    """Write OBJ, MTL (with the PBR extension: Pr, Pm, map_Pr, map_Pm, norm) and PNG textures."""
-    path = Path(path)
-    named = {id(m.material): f"{i}_{m.material.name}".replace(" ", "_") for i, m in enumerate(asset.meshes)}
-    mtl: list[str] = []
-    for m in {id(m.material): m.material for m in asset.meshes}.values():
-        mtl += _mtl_lines(replace(m, name=named[id(m)]), path)
-    with replacing(path.with_suffix(".mtl")) as temporary:
-        temporary.write_text("\n".join(mtl) + "\n")
-    lines = ["# appearance-opt", f"mtllib {path.stem}.mtl"]
-    start = np.ones(3, np.int64)  # of this mesh's positions, texture coordinates and normals in the whole file
-    for mesh in asset.meshes:
-        lines += [f"o {mesh.name}", f"usemtl {named[id(mesh.material)]}"]
-        colors = np.empty((len(mesh.positions), 0)) if mesh.colors is None else mesh.colors
-        rows = np.concatenate([mesh.positions, colors], axis=1)
-        lines += ["v " + " ".join(f"{x:.9g}" for x in row) for row in rows.tolist()]
-        if mesh.uvs is not None:
-            lines += [f"vt {u:.9g} {1 - v:.9g}" for u, v in mesh.uvs.tolist()]
-        if mesh.normals is not None:
-            lines += [f"vn {x:.9g} {y:.9g} {z:.9g}" for x, y, z in mesh.normals.tolist()]
-        # vertices are split at seams: one index serves all that a mesh has
-        has = (True, mesh.uvs is not None, mesh.normals is not None)
-        form = {(True, False): "{0}/{1}", (False, True): "{0}//{2}", (True, True): "{0}/{1}/{2}"}.get(has[1:], "{0}")
-        for face in mesh.faces.tolist():
-            lines.append("f " + " ".join(form.format(*(start + i)) for i in face))
-        start += np.where(has, len(mesh.positions), 0)
-    with replacing(path) as temporary:
-        temporary.write_text("\n".join(lines) + "\n")
-
-
-def _mtl_lines(m: Material, path: Path) -> list[str]:
-    kd = " ".join(f"{x:.6g}" for x in m.base_color)
-    lines = [f"newmtl {m.name}", f"Kd {kd}", f"Pr {m.roughness:.6g}", f"Pm {m.metalness:.6g}"]
-
-    def picture(suffix: str, pixels: NDArray) -> str:
-        target = path.with_name(f"{path.stem}_{m.name}_{suffix}.png")
-        with replacing(target) as temporary:
-            temporary.write_bytes(images.encode_png(np.ascontiguousarray(pixels)))
-        return target.name
-
-    if m.base_color_texture is not None:
-        lines.append("map_Kd " + picture("base_color", m.base_color_texture.pixels))
-    if m.orm_texture is not None:
-        lines.append("map_Pr " + picture("roughness", m.orm_texture.pixels[..., 1:2]))
-        lines.append("map_Pm " + picture("metalness", m.orm_texture.pixels[..., 2:3]))
-    if m.emits:
-        lines.append("Ke " + " ".join(f"{x:.6g}" for x in m.emission))
-        if m.emission_texture is not None:
-            lines.append("map_Ke " + picture("emission", m.emission_texture.pixels))
-    if m.normal_texture is not None:
-        lines.append("norm " + picture("normal", m.normal_texture.pixels[..., :3]))
-    return [*lines, ""]
 
 
 def _unit(v: NDArray) -> NDArray[np.float32]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import tempfile
 from contextlib import contextmanager
 from pathlib import Path
@@ -54,6 +55,15 @@ def read_bytes(path: Path) -> bytes:
     if not data:
         raise InputError(f"{path}: the file is empty")
     return data
+
+
+MAX_NAME = 80
+"""Characters of a material's name in the name of a file: file systems end at 255 bytes."""
+
+
+def file_name(name: str) -> str:
+    """A name that every file system takes, made of ``name``. Different names may become equal."""
+    return re.sub(r"[^A-Za-z0-9._-]", "_", name)[:MAX_NAME]
 
 
 @contextmanager

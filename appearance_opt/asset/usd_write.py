@@ -12,7 +12,7 @@ import numpy as np
 
 from appearance_opt.asset import images
 from appearance_opt.asset.height import as_16_bit, height_png
-from appearance_opt.asset.paths import replacing
+from appearance_opt.asset.paths import MAX_NAME, replacing
 from appearance_opt.asset.types import linear_to_srgb
 
 if TYPE_CHECKING:
@@ -66,7 +66,8 @@ def _write_stage(asset: Asset, root: Path, textures: str) -> None:
     materials: dict[int, Any] = {}
     for k, mesh in enumerate(asset.meshes):
         if id(mesh.material) not in materials:
-            target = f"/{name}/Materials/M{len(materials)}_{Tf.MakeValidIdentifier(mesh.material.name)}"
+            word = Tf.MakeValidIdentifier(mesh.material.name)[:MAX_NAME]
+            target = f"/{name}/Materials/M{len(materials)}_{word}"
             materials[id(mesh.material)] = _material(stage, target, mesh.material, root.parent / textures)
         _mesh(stage, f"/{name}/G{k}_{Tf.MakeValidIdentifier(mesh.name)}", mesh, materials[id(mesh.material)])
     stage.GetRootLayer().Save()

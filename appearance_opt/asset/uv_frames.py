@@ -79,6 +79,21 @@ def unified(
     return out
 
 
+def kept(
+    meshes: Sequence[Mesh], frames_of: Mapping[int, Mapping[str, NDArray]], note: Callable[[str], None]
+) -> list[Mesh]:
+    """The meshes as they are, for ``keep_layout`` of ``asset.load``; ``note`` is told whose textures would have been
+    moved. Parameters as for ``unified``."""
+    for material in {id(m.material): m.material for m in meshes}.values():
+        frames = frames_of.get(id(material), {})
+        moved = [n for n, f in frames.items() if getattr(material, n) is not None and not np.allclose(f, affine(None))]
+        if moved:
+            which = ", ".join(n.replace("_texture", "").replace("_", " ") for n in moved)
+            told = f"material '{material.name}': the transform of its textures ({which}) is not applied"
+            note(f"{told}: the mesh keeps its texture coordinates")
+    return list(meshes)
+
+
 def alike(uvs: Sequence[NDArray], textures: Mapping[str, Texture], frames: Mapping[str, NDArray]) -> bool:
     """Can the textures share the first one's transform and wrap mode? Wrap modes do not matter within the image."""
     first = next(iter(frames.values()))

@@ -1,0 +1,228 @@
+"""Wavefront MTL, with the PBR extension (Pr, Pm, map_Pr, map_Pm, Ke, norm), to materials."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from appearance_opt.asset import images, uv_frames
+from appearance_opt.asset.packing import pack_orm
+from appearance_opt.asset.paths import read_bytes
+from appearance_opt.asset.types import Material, Texture, Wrap
+from appearance_opt.errors import InputError
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from appearance_opt.asset.companions import Companions
+    from appearance_opt.asset.types import ColorSpace
+
+_MAP_OPTIONS = {
+    "-blendu": 1, "-blendv": 1, "-boost": 1, "-mm": 2, "-o": 3, "-s": 3, "-t": 3, "-texres": 1,
+    "-clamp": 1, "-bm": 1, "-imfchan": 1, "-type": 1, "-cc": 1,
+    "-colorspace": 1,
+}  # fmt: skip
+"""Options of map statements and how many values follow them, at most for those of ``_OPTIONAL``."""
+
+_OPTIONAL = ("-o", "-s", "-t")
+"""Options whose second and third values may be left out (MTL specification, "Options for texture map statements")."""
+
+_NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?")
+
+_NORMAL, _BUMP = ("norm", "map_kn"), ("map_bump", "bump")
+_USED = ("map_kd", "map_pr", "map_pm", "map_ke", "map_ka", *_NORMAL, *_BUMP)
+"""Maps that are read; that of the ambient colour, which lights nothing here, usually repeats the diffuse one."""
+
+_NOT_MAPS = ("map_aat", "map_d")
+"""The first is a switch; the second has a note of its own."""
+
+UNIT, MOSTLY = 0.1, 0.9
+"""A picture is taken for a normal map if at least the share ``MOSTLY`` of its texels, decoded, have a length within
+``UNIT`` of 1 and point outward."""
+
+
+@dataclass(frozen=True)
+class _Map:
+    """A map statement: the file, and what its options say. ``frame``: (2, 3), from texture coordinates to the map's."""
+
+    file: str
+    wrap: Wrap = "repeat"
+    strength: float = 1.0
+    channel: int = 0
+    frame: NDArray[np.float64] = field(default_factory=lambda: uv_frames.affine(None))
+    ignored: tuple[str, ...] = ()
+
+
+class MaterialReader:
+    """Materials of the MTL files of one OBJ file: ``by_name``, and by ``id`` of a material the ``frames`` of its
+    textures (see ``uv_frames.unified``)."""
+
+    def __init__(self, companions: Companions) -> None:
+        self.companions, self.note = companions, companions.note
+        self.by_name: dict[str, Material] = {}
+        self.frames: dict[int, dict[str, NDArray[np.float64]]] = {}
+
+    def read(self, path: Path) -> None:
+        """Add the materials of a file. Raises InputError."""
+        statements: dict[str, dict[str, str]] = {}
+        current: dict[str, str] = {}
+        for line in read_bytes(path).decode("utf-8", errors="replace").splitlines():
+            words = line.split(None, 1)
+            if len(words) < 2 or words[0].startswith("#"):
+                continue
+            if words[0] == "newmtl":
+                current = statements.setdefault(words[1].strip(), {})
+            else:
+                current[words[0].lower()] = words[1].strip()
+        for name, values in statements.items():
+            try:
+                one = _Statements(name, values, path, self.companions)
+                material = one.material()
+            except (ValueError, IndexError):
+                raise InputError(f"{path}: a value of material '{name}' is missing or not a number") from None
+            self.by_name[name] = material
+            self.frames[id(material)] = one.frames
+
+
+class _Statements:
+    """The statements of one material, by lower-case key."""
+
+    def __init__(self, name: str, values: dict[str, str], path: Path, companions: Companions) -> None:
+        self.name, self.values, self.path, self.companions = name, values, path, companions
+        self.frames: dict[str, NDArray[np.float64]] = {}
+
+    def material(self) -> Material:
+        """Phong exponents become roughness sqrt(2 / (Ns + 2)). Constants beside a map are ignored, for many exporters
+        write 0 or 0.8 there, and Blender ignores them, too; without the map they count."""
+        color = self._numbers("kd", [0.8, 0.8, 0.8])
+        color = color * 3 if len(color) == 1 else color
+        base = self._texture("base_color_texture", "map_kd", space="srgb")
+        shininess = self._numbers("ns", [1.125])[0]
+        roughness = self._numbers("pr", [float(np.sqrt(2 / (max(shininess, 0.0) + 2)))])[0]
+        rough_map = self._texture("orm_texture", "map_pr", one_channel=True)
+        metal_map = self._texture("orm_texture", "map_pm", one_channel=True)
+        glow_map = self._texture("emission_texture", "map_ke", space="srgb")
+        # without the map that says where it glows, nothing does
+        lost = glow_map is None and "map_ke" in self.values
+        glow = [0.0] * 3 if lost else self._numbers("ke", [float(glow_map is not None)] * 3)
+        normal, strength = self._normal()
+        self._note_what_is_dropped()
+        return Material(
+            name=self.name,
+            base_color=(1.0, 1.0, 1.0) if base is not None else (color[0], color[1], color[2]),
+            roughness=1.0 if rough_map is not None else min(max(roughness, 0.0), 1.0),
+            metalness=1.0 if metal_map is not None else self._numbers("pm", [0.0])[0],
+            normal_scale=strength,
+            base_color_texture=base,
+            orm_texture=None if rough_map is None and metal_map is None else pack_orm(rough_map, metal_map),
+            normal_texture=normal,
+            emission=(glow[0], glow[1], glow[2]),
+            emission_texture=glow_map,
+        )
+
+    def _numbers(self, key: str, default: list[float]) -> list[float]:
+        text = self.values.get(f"{key}_without_map", self.values.get(key))  # see ``obj_write``
+        return default if text is None else [float(w) for w in text.split()[:3]]
+
+    def _normal(self) -> tuple[Texture | None, float]:
+        """(normal map, strength). What is named as a bump map is often one; a true bump map holds heights, and has no
+        place here."""
+        key = next((k for k in (*_NORMAL, *_BUMP) if k in self.values), None)
+        if key is None:
+            return None, 1.0
+        texture = self._texture("normal_texture", key)
+        if texture is not None and key in _BUMP and not looks_like_normals(texture):
+            self._note(f"its bump map '{_map(self.values[key]).file}' ignored: it holds heights, not normals")
+            return None, 1.0
+        return texture, _map(self.values[key]).strength
+
+    def _texture(self, slot: str, key: str, space: ColorSpace = "linear", one_channel: bool = False) -> Texture | None:
+        """The map of a statement; None without one, or if it is missing and that is to be ignored."""
+        if key not in self.values:
+            return None
+        given = _map(self.values[key])
+        pixels = self.companions.read(lambda: images.read(self.companions.find(given.file, self.path)))
+        if pixels is None:
+            return None
+        if given.ignored:
+            self._note(f"{' '.join(given.ignored)} of {key} ignored")
+        if slot in self.frames and not np.allclose(self.frames[slot], given.frame):
+            self._note("the maps of roughness and metalness differ in transform: the first one's is used for both")
+        self.frames.setdefault(slot, given.frame)
+        if one_channel:
+            pixels = pixels[..., min(given.channel, pixels.shape[2] - 1)][..., None]
+        elif pixels.shape[2] < 3:
+            pixels = np.repeat(pixels[..., :1], 3, axis=2)
+        if pixels.dtype.kind == "f":  # EXR and HDR files are linear
+            space = "linear"
+        return Texture(np.ascontiguousarray(pixels), space, (given.wrap, given.wrap))
+
+    def _note_what_is_dropped(self) -> None:
+        dissolve = self.values.get("d", "1").split()[-1]  # it may have the option -halo
+        opacity = 1 - self._numbers("tr", [0.0])[0] if "d" not in self.values else float(dissolve)
+        if opacity < 1 or "map_d" in self.values:
+            self._note("transparency ignored, drawn opaque")
+        maps = [k for k in self.values if k.startswith("map_") or k in ("disp", "decal", "refl")]
+        dropped = [k for k in maps if k not in (*_USED, *_NOT_MAPS)]
+        if dropped:
+            self._note(f"{', '.join(dropped)} ignored")
+
+    def _note(self, text: str) -> None:
+        self.companions.note(f"material '{self.name}': {text}")
+
+
+def _map(statement: str) -> _Map:
+    """The parts of a map statement. The name of the file, which may have spaces and quotation marks, is what is left
+    after the options. Raises ValueError and IndexError for values that are missing."""
+    found: dict[str, list[str]] = {}
+    rest = statement.strip()
+    while (option := rest.split(None, 1)[0] if rest else "") in _MAP_OPTIONS:
+        values, rest = _taken(rest[len(option) :].lstrip(), option)
+        found[option] = values
+    offset, scale = (_numbers(found.get(o, []), default) for o, default in (("-o", 0.0), ("-s", 1.0)))
+    ignored = [o for o in ("-t", "-mm", "-boost") if o in found]
+    if found.get("-mm") and [float(x) for x in found["-mm"]] == [0, 1]:
+        ignored.remove("-mm")
+    return _Map(
+        file=rest[1:-1] if len(rest) > 2 and rest[0] == rest[-1] == '"' else rest,
+        wrap="clamp" if found.get("-clamp") == ["on"] else "repeat",
+        strength=float(found.get("-bm", ["1"])[0]),
+        channel={"g": 1, "b": 2, "m": 3}.get(found.get("-imfchan", ["l"])[0], 0),
+        frame=uv_frames.usd_affine(scale[:2], 0.0, offset[:2]),  # these count v upward, too
+        ignored=tuple(ignored),
+    )
+
+
+def _taken(text: str, option: str) -> tuple[list[str], str]:
+    """(values of an option, the rest of the statement)."""
+    values: list[str] = []
+    while len(values) < _MAP_OPTIONS[option]:
+        word, rest = (text.split(None, 1) + ["", ""])[:2]
+        if (
+            values
+            and option in _OPTIONAL
+            and not (rest and re.fullmatch(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", word))
+        ):
+            break  # the name of the file, even if it is a number
+        if not word:
+            raise ValueError
+        values.append(word)
+        text = rest
+    return values, text
+
+
+def _numbers(words: list[str], default: float) -> tuple[float, float, float]:
+    u, v, w = [*(float(x) for x in words), *(default,) * 3][:3]
+    return u, v, w
+
+
+def looks_like_normals(texture: Texture) -> bool:
+    """Is a picture a tangent-space normal map? See ``MOSTLY``."""
+    n = texture.linear()[..., :3] * 2 - 1
+    fits = (np.abs(np.linalg.norm(n, axis=-1) - 1) < UNIT) & (n[..., 2] > 0)
+    return bool(fits.mean() >= MOSTLY)

@@ -1,0 +1,107 @@
+"""An Asset to Wavefront OBJ and MTL."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from appearance_opt.asset import images
+from appearance_opt.asset.encoding import encoded_for
+from appearance_opt.asset.paths import file_name, replacing
+from appearance_opt.asset.types import Texture, linear_to_srgb
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from appearance_opt.asset.types import Asset, Material, Mesh
+
+
+def save_obj(asset: Asset, path: Path) -> None:
+    """Write OBJ, MTL (with the PBR extension: Pr, Pm, map_Pr, map_Pm, norm) and PNG textures.
+
+    Vertex colours follow the positions, sRGB encoded, as Blender and MeshLab write and read them.
+    """
+    # the number keeps names apart that are equal, or become so
+    named = {id(m.material): f"{i}_{_word(m.material.name)}" for i, m in enumerate(asset.meshes)}
+    mtl = ["# appearance-opt"]
+    for m in {id(m.material): m.material for m in asset.meshes}.values():
+        mtl += _mtl_lines(replace(m, name=named[id(m)]), path)
+    with replacing(path.with_suffix(".mtl")) as temporary:
+        temporary.write_text("\n".join(mtl) + "\n", encoding="utf-8")
+    lines = ["# appearance-opt", f"mtllib {path.stem}.mtl"]
+    start = np.ones(3, np.int64)  # of this mesh's positions, texture coordinates and normals in the whole file
+    for mesh in asset.meshes:
+        lines += [f"o {' '.join(mesh.name.split())}", f"usemtl {named[id(mesh.material)]}", *_vertices(mesh)]
+        # vertices are split at seams: one index serves all that a mesh has
+        has = (True, mesh.uvs is not None, mesh.normals is not None)
+        form = {(True, False): "{0}/{1}", (False, True): "{0}//{2}", (True, True): "{0}/{1}/{2}"}.get(has[1:], "{0}")
+        for face in mesh.faces.tolist():
+            lines.append("f " + " ".join(form.format(*(start + i)) for i in face))
+        start += np.where(has, len(mesh.positions), 0)
+    with replacing(path) as temporary:
+        temporary.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def _vertices(mesh: Mesh) -> list[str]:
+    colors = np.empty((len(mesh.positions), 0)) if mesh.colors is None else linear_to_srgb(np.clip(mesh.colors, 0, 1))
+    rows = np.concatenate([mesh.positions, colors], axis=1)
+    lines = ["v " + " ".join(f"{x:.9g}" for x in row) for row in rows.tolist()]
+    if mesh.uvs is not None:
+        lines += [f"vt {u:.9g} {1 - v:.9g}" for u, v in mesh.uvs.tolist()]
+    if mesh.normals is not None:
+        lines += [f"vn {x:.9g} {y:.9g} {z:.9g}" for x, y, z in mesh.normals.tolist()]
+    return lines
+
+
+def _mtl_lines(m: Material, path: Path) -> list[str]:
+    """The statements of a material, whose textures are written beside ``path``.
+
+    Readers differ in whether Kd, Pr and Pm multiply their maps (the Wavefront convention) or stand back for them
+    (Blender): the maps hold the factors, and the constants are 1. ``..._without_map``, a statement of our own that
+    others pass over, is the factor alone, for when the map gets lost.
+    """
+
+    def picture(suffix: str, pixels: NDArray) -> str:
+        target = path.with_name(f"{path.stem}_{file_name(m.name)}_{suffix}.png")
+        with replacing(target) as temporary:
+            temporary.write_bytes(images.encode_png(np.ascontiguousarray(pixels)))
+        return target.name
+
+    def plane(channel: int, factor: float) -> NDArray:
+        assert m.orm_texture is not None
+        one = Texture(m.orm_texture.linear()[..., channel : channel + 1], "linear")
+        if m.orm_texture.color_space == "linear":
+            one = replace(one, pixels=m.orm_texture.pixels[..., channel : channel + 1])
+        return encoded_for(one, "linear", (factor,))
+
+    def constant(key: str, values: tuple[float, ...], mapped: bool) -> list[str]:
+        text = " ".join(f"{x:.6g}" for x in values)
+        if not mapped or all(x == 1 for x in values):
+            return [f"{key} {text}"]
+        return [f"{key} {' '.join('1' for _ in values)}", f"{key}_without_map {text}"]
+
+    orm = m.orm_texture is not None
+    lines = [f"newmtl {m.name}", *constant("Kd", m.base_color, m.base_color_texture is not None)]
+    lines += [*constant("Pr", (m.roughness,), orm), *constant("Pm", (m.metalness,), orm)]
+    if m.base_color_texture is not None:
+        lines.append("map_Kd " + picture("base_color", encoded_for(m.base_color_texture, "srgb", m.base_color)))
+    if orm:
+        lines.append("map_Pr " + picture("roughness", plane(1, m.roughness)))
+        lines.append("map_Pm " + picture("metalness", plane(2, m.metalness)))
+    if m.emits:
+        lines.append("Ke " + " ".join(f"{x:.6g}" for x in m.emission))
+        if m.emission_texture is not None:
+            lines.append("map_Ke " + picture("emission", encoded_for(m.emission_texture, "srgb")))
+    if m.normal_texture is not None:
+        strength = "" if m.normal_scale == 1 else f"-bm {m.normal_scale:.6g} "
+        lines.append(f"norm {strength}" + picture("normal", encoded_for(m.normal_texture, "linear")[..., :3]))
+    return [*lines, ""]
+
+
+def _word(name: str) -> str:
+    """A name without white space, at which statements end."""
+    return "_".join(name.split())
