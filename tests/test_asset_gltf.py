@@ -337,3 +337,13 @@ def test_real_helmet_becomes_one_scene(assets_dir: Path) -> None:
     assert asset.triangle_count == 94722
     assert len({id(m.material) for m in asset.meshes}) == 5 + 1 - (6 - len(asset.meshes))
     assert all(m.normals is not None and m.uvs is not None for m in asset.meshes)
+
+
+@pytest.mark.parametrize("stem", ["my #1", "50%20off?", "ä b"])
+def test_uris_are_percent_encoded(tmp_path: Path, ball: Asset, stem: str) -> None:
+    """RFC 3986: a plain # would start a fragment, and a plain % an escape."""
+    save(ball, tmp_path / f"{stem}.gltf")
+    document = json.loads((tmp_path / f"{stem}.gltf").read_text())
+    for uri in [x["uri"] for x in document["buffers"] + document["images"]]:
+        assert set(uri) <= set("abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789._-%")
+    assert load(tmp_path / f"{stem}.gltf").meshes[0].material.base_color_texture is not None

@@ -12,15 +12,15 @@ from urllib.parse import quote
 import numpy as np
 
 from appearance_opt.asset import images
+from appearance_opt.asset.encoding import encoded_for
 from appearance_opt.asset.gltf_materials import STRENGTH
 from appearance_opt.asset.height import as_16_bit, height_png
 from appearance_opt.asset.paths import replacing
-from appearance_opt.asset.types import linear_to_srgb
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from appearance_opt.asset.types import Asset, Displacement, Material, Mesh, Texture
+    from appearance_opt.asset.types import Asset, ColorSpace, Displacement, Material, Mesh, Texture
 
 _WRAPS = {"repeat": 10497, "clamp": 33071, "mirror": 33648}
 _ARRAY_BUFFER, _ELEMENT_BUFFER = 34962, 34963
@@ -45,10 +45,10 @@ def save_gltf(asset: Asset, path: Path) -> None:
     for k, data in enumerate(writer.image_files):
         with replacing(path.with_name(f"{path.stem}_{k}.png")) as temporary:
             temporary.write_bytes(data)
-        writer.json["images"][k] = {"uri": f"{path.stem}_{k}.png"}
+        writer.json["images"][k] = {"uri": quote(f"{path.stem}_{k}.png")}
     with replacing(path.with_suffix(".bin")) as temporary:
         temporary.write_bytes(bytes(writer.binary))
-    writer.json["buffers"] = [{"uri": f"{path.stem}.bin", "byteLength": len(writer.binary)}]
+    writer.json["buffers"] = [{"uri": quote(f"{path.stem}.bin"), "byteLength": len(writer.binary)}]
     with replacing(path) as temporary:
         temporary.write_text(json.dumps(writer.json, indent=1))
 
@@ -70,9 +70,9 @@ class _Writer:
             "accessors": [],
             "bufferViews": [],
         }
-        self._textures: dict[int, int] = {}
+        self._textures: dict[tuple[int, str], int] = {}
         self._samplers: list[dict[str, int]] = []
-        self._pending: list[Texture] = []
+        self._pending: list[tuple[Texture, ColorSpace]] = []
         materials: dict[int, int] = {}
         for mesh in asset.meshes:
             if id(mesh.material) not in materials:
@@ -80,7 +80,7 @@ class _Writer:
                 self.json.setdefault("materials", []).append(self._material(mesh.material))
             self.json["meshes"].append(self._mesh(mesh, materials[id(mesh.material)]))
         with ThreadPoolExecutor() as pool:
-            self.image_files = list(pool.map(_png, self._pending))
+            self.image_files = list(pool.map(lambda p: images.encode_png(encoded_for(*p)), self._pending))
         if self._pending:
             self.json["images"] = [{} for _ in self._pending]
             self.json["samplers"] = self._samplers
@@ -149,7 +149,7 @@ class _Writer:
             "metallicFactor": m.metalness,
         }
         if m.base_color_texture is not None:
-            pbr["baseColorTexture"] = {"index": self._texture(m.base_color_texture)}
+            pbr["baseColorTexture"] = {"index": self._texture(m.base_color_texture, "srgb")}
         if m.orm_texture is not None:
             pbr["metallicRoughnessTexture"] = {"index": self._texture(m.orm_texture)}
         out: dict[str, Any] = {"name": m.name, "pbrMetallicRoughness": pbr, "doubleSided": m.double_sided}
@@ -171,7 +171,7 @@ class _Writer:
         strength = max(1.0, *m.emission)  # factors end at 1
         out["emissiveFactor"] = [x / strength for x in m.emission]
         if m.emission_texture is not None:
-            out["emissiveTexture"] = {"index": self._texture(m.emission_texture)}
+            out["emissiveTexture"] = {"index": self._texture(m.emission_texture, "srgb")}
         if strength > 1:
             out["extensions"] = {STRENGTH: {"emissiveStrength": strength}}
             self.json["extensionsUsed"] = [STRENGTH]
@@ -185,8 +185,10 @@ class _Writer:
         uri = quote(self._displacements[id(given)])
         return {"uri": uri, "scale": d.scale, "midLevel": d.mid, "texCoord": 0, "unit": "metre"}
 
-    def _texture(self, texture: Texture) -> int:
-        if id(texture) not in self._textures:
+    def _texture(self, texture: Texture, space: ColorSpace = "linear") -> int:
+        """Index of a texture in a slot of that encoding."""
+        key = (id(texture), space)
+        if key not in self._textures:
             sampler = {
                 "magFilter": 9729,
                 "minFilter": 9987,
@@ -195,25 +197,14 @@ class _Writer:
             }
             if sampler not in self._samplers:
                 self._samplers.append(sampler)
-            self._textures[id(texture)] = len(self._pending)
+            self._textures[key] = len(self._pending)
             entry = {"source": len(self._pending), "sampler": self._samplers.index(sampler)}
             self.json.setdefault("textures", []).append(entry)
-            self._pending.append(texture)
-        return self._textures[id(texture)]
+            self._pending.append((texture, space))
+        return self._textures[key]
 
 
 def _unit(v: NDArray) -> NDArray[np.float32]:
     """Unit length to float32 precision, which the validator asks for."""
     w = np.asarray(v, np.float64)
     return (w / np.maximum(np.linalg.norm(w, axis=1, keepdims=True), 1e-30)).astype(np.float32)
-
-
-def _png(texture: Texture) -> bytes:
-    """PNG with the encoding that glTF expects of the slot: float pixels become 8 bits."""
-    pixels = texture.pixels
-    if pixels.dtype not in (np.uint8, np.uint16):
-        value = np.clip(pixels.astype(np.float32), 0, 1)
-        if texture.color_space == "srgb":
-            value[..., :3] = linear_to_srgb(value[..., :3])
-        pixels = (value * 255 + 0.5).astype(np.uint8)
-    return images.encode_png(pixels)

@@ -223,6 +223,8 @@ class MaterialReader:
             space = "linear"
         elif encoding == "sRGB":
             space = "srgb"
+        elif pixels.dtype != np.uint8 or pixels.shape[2] < 3:
+            space = "linear"  # "auto" takes 8-bit colours alone for sRGB
         if channel in _CHANNEL and channel != "rgb":
             pixels = pixels[..., min(_CHANNEL[channel], pixels.shape[2] - 1)][..., None]
         elif pixels.shape[2] < 3:

@@ -11,14 +11,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from appearance_opt.asset import images
+from appearance_opt.asset.encoding import encoded_for
 from appearance_opt.asset.height import as_16_bit, height_png
 from appearance_opt.asset.paths import MAX_NAME, replacing
-from appearance_opt.asset.types import linear_to_srgb
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
+    from appearance_opt.asset.types import Asset, ColorSpace, Material, Mesh, Texture
 
-    from appearance_opt.asset.types import Asset, Material, Mesh, Texture
+_SPACES: dict[str, ColorSpace] = {"sRGB": "srgb", "raw": "linear"}
+"""Our names of UsdUVTexture's colour spaces."""
 
 
 def save_usd(asset: Asset, path: Path) -> None:
@@ -154,7 +155,7 @@ class _Preview:
 
         file = self.folder / f"{self.target.rsplit('/', 1)[1]}_{key}.png"
         self.folder.mkdir(exist_ok=True)
-        file.write_bytes(images.encode_png(_stored(texture)) if data is None else data)
+        file.write_bytes(images.encode_png(encoded_for(texture, _SPACES[space])) if data is None else data)
         node = self._node(key, "UsdUVTexture")
         node.CreateInput("file", self.types.Asset).Set(Sdf.AssetPath(f"./{self.folder.name}/{file.name}"))
         node.CreateInput("sourceColorSpace", self.types.Token).Set(space)
@@ -193,13 +194,3 @@ class _Preview:
         self.connect("metallic", "Float", node, "b")
         if m.has_occlusion:
             self.connect("occlusion", "Float", node, "r")
-
-
-def _stored(texture: Texture) -> NDArray:
-    """8- or 16-bit pixels of a texture."""
-    if texture.pixels.dtype in (np.uint8, np.uint16):
-        return texture.pixels
-    value = np.clip(texture.pixels.astype(np.float32), 0, 1)
-    if texture.color_space == "srgb":
-        value[..., :3] = linear_to_srgb(value[..., :3])
-    return (value * 255 + 0.5).astype(np.uint8)
