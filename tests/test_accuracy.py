@@ -96,6 +96,8 @@ def test_the_brdf_is_reciprocal_and_metal_never_reflects_more_than_it_gets() -> 
         for cosine in (0.05, 0.3, 1.0):
             # measured at most 0.9996; the midpoint sum is good to 1e-3 at the sharpest peak
             assert physics.albedo(1.0, roughness, 1.0, cosine, 200) < 1.002
+    # alpha = 1 seen head-on: 2 int l / (2 (1 + l)) dl = 1 - ln 2; measured 3e-5 apart
+    assert physics.albedo(1.0, 1.0, 1.0, 1.0, 200) == pytest.approx(1 - np.log(2), rel=2e-4)
     # a smooth white metal loses nothing: measured 0.9996
     assert physics.albedo(1.0, 0.08, 1.0, 0.7) == pytest.approx(1.0, abs=2e-3)
 

@@ -29,9 +29,10 @@ from appearance_opt.reference.mesh import MeshReference
 from appearance_opt.reference.pool import ReferencePool
 from appearance_opt.render.gradient import Quality
 from appearance_opt.views import ViewSampler
-from tests.kernels import settles
+from tests.kernels import BLOCK, compiled
 
 SAMPLER = ViewSampler((0.0, 0.0, 0.0), 1.0, seed=1)
+LOOKS = 15
 
 
 def options(**values: object) -> SimplifyOptions:
@@ -51,12 +52,13 @@ def make_fit(ball: Asset, fitted: tuple[str, ...] = ("shape", "normal", "materia
 def test_a_fit_finds_a_painted_ball(ball: Asset) -> None:
     model, pool, validation = make_fit(ball)
     result = fit(model, pool, validation, FitOptions(steps=300, quality=Quality(1.0, 4, 1), relative=False))
-    # from random colours on a smaller sphere: measured 13.6 -> 19.2 dB after 120 steps
+    # from random colours on a smaller sphere: measured 13.8 -> 27.1 dB
     assert result.curve[0].psnr < 15
-    assert result.curve[-1].psnr > result.curve[0].psnr + 5
+    assert result.curve[-1].psnr > result.curve[0].psnr + 10
     assert result.skipped == 0
     radius = np.linalg.norm(model.host_positions(), axis=1)
-    assert radius.mean() > 0.93  # from 0.9: the silhouettes pull it out towards the ball's radius of 1
+    # from 0.9: the silhouettes pull it out towards the ball's radius of 1; measured 0.996
+    assert radius.mean() > 0.98
 
 
 def test_what_is_not_fitted_does_not_exist(ball: Asset) -> None:
@@ -75,9 +77,16 @@ def test_what_is_not_fitted_does_not_exist(ball: Asset) -> None:
 @pytest.mark.parametrize("visibility", ["edges", "pairs"])
 def test_no_kernel_is_compiled_after_the_first_steps(ball: Asset, visibility: str) -> None:
     model, pool, validation = make_fit(ball)
-    run = loop._Run(model, pool, validation, FitOptions(steps=100, quality=Quality(visibility=visibility)), None, None)
+    ends = LOOKS + 1  # a power of two; the fit does not end, so that every look belongs to a step
+    chosen = FitOptions(steps=ends * BLOCK, quality=Quality(visibility=visibility), validate_every=1 / ends)
+    run = loop._Run(model, pool, validation, chosen, None, None)
     run.look()
-    assert settles(run)
+    blocks = [compiled(run, BLOCK) for _ in range(LOOKS)]
+    assert len(run.result.curve) == LOOKS + 1  # each block holds a look at the held-out views
+    # Kernels exist in up to two variants, by the alignment of the memory that NumPy hands over, and the second is met
+    # at random: one of the later blocks may compile, as two would not if a step, a look or every other one of them did.
+    # Measured: none after 17 steps
+    assert sum(n > 0 for n in blocks[LOOKS // 2 :]) <= 1, blocks
 
 
 def test_a_start_is_never_made_worse(ball: Asset) -> None:
@@ -102,8 +111,9 @@ def test_resuming_goes_on_where_it_stopped(ball: Asset, tmp_path: Path) -> None:
     second, pool, validation = make_fit(ball)
     result = fit(second, pool, validation, o, None, Checkpointer(tmp_path, "x", True, 1e9))
     assert result.steps == 12
-    # additions of several threads are in no fixed order: measured 1e-6
-    np.testing.assert_allclose(second.host_positions(), whole.host_positions(), atol=2e-3)
+    # threads add up gradients in no fixed order: 38 of 40 pairs of equal fits ended within 6e-8, two had four vertices
+    # 6e-5 apart
+    np.testing.assert_allclose(second.host_positions(), whole.host_positions(), atol=2e-4)
     with pytest.raises(InputError, match="another input or other options"):
         fit(second, pool, validation, o, None, Checkpointer(tmp_path, "y", True, 1e9))
 

@@ -122,6 +122,15 @@ def test_importance_draws_triangles_to_what_is_seen(ball: Asset) -> None:
     assert visible[:n].all() and not visible[n:].any()
     assert weight[:n].min() > 100 * weight[n:].max()
 
+    def outside(weights: np.ndarray | None) -> int:
+        q, g = decimate(p, f, 400, weights)
+        assert len(g) == 400
+        return int((np.linalg.norm(q[g].mean(axis=1), axis=1) > 0.75).sum())
+
+    # of 400 triangles, measured: 276 by the shape alone, 378 with the weights
+    assert outside(None) < 300
+    assert outside(weight) > 360
+
 
 def test_atlas_covers_every_face_once() -> None:
     mesh = sphere(600, (0.0, 0.0, 0.0), 1.0, 256)

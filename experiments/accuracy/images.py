@@ -14,7 +14,7 @@ from appearance_opt.asset.types import Mesh, Texture, linear_to_srgb
 from appearance_opt.jobs.simplify import in_frame
 from appearance_opt.reference.mesh import MeshReference
 from appearance_opt.render.deferred import Grid
-from appearance_opt.views import ViewSampler, framing
+from appearance_opt.views import Views, ViewSampler, framing
 from experiments import mitsuba_peer
 
 SAMPLES = 64
@@ -41,6 +41,11 @@ def compare(path: Path, resolution: int = 256, normal_maps: bool = False) -> Com
     if not normal_maps:
         asset = _plain(asset)
     views = ViewSampler((0.0, 0.0, 0.0), 1.0, seed=3, light="headlight").draw(0, 1)
+    return compare_asset(asset, views, resolution)
+
+
+def compare_asset(asset: Asset, views: Views, resolution: int) -> Comparison:
+    """The first of the views. ``mitsuba_peer.register`` comes before."""
     # textures unfiltered on both sides: the samples are the filter
     flat = MeshReference(asset).render_device(views.records(), Grid(1, resolution), SAMPLES, 1e-3)
     ours = np.array(flat).reshape(resolution, resolution, 4)[..., :3]
