@@ -117,16 +117,23 @@ def handedness(mesh: LatentMesh) -> NDArray[np.float32]:
     return out
 
 
-def local_edge_length(positions: NDArray, faces: NDArray) -> NDArray[np.float32]:
-    """(V,) mean length of the edges around each vertex, positive; the mesh's mean for vertices without one."""
-    length = np.zeros(len(positions))
-    count = np.zeros(len(positions))
+def edges_around(points: NDArray, faces: NDArray) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Total length and number (V,) of the edges at each of the points (V, D), of all faces (F, 3) around it: an edge
+    counts once for each of its faces."""
+    length, count = np.zeros(len(points)), np.zeros(len(points), np.int64)
     for a, b in ((0, 1), (1, 2), (2, 0)):
         i, j = faces[:, a], faces[:, b]
-        edge = np.linalg.norm(positions[i].astype(np.float64) - positions[j], axis=1)
+        edge = np.linalg.norm(points[i].astype(np.float64) - points[j], axis=1)
         for k in (i, j):
-            length += np.bincount(k, edge, len(positions))
-            count += np.bincount(k, minlength=len(positions))
+            length += np.bincount(k, edge, len(points))
+            count += np.bincount(k, minlength=len(points))
+    return length, count
+
+
+def local_edge_length(positions: NDArray, faces: NDArray) -> NDArray[np.float32]:
+    """(V,) mean length of the edges at each vertex, of all faces around it, positive; the mesh's mean for vertices
+    without one."""
+    length, count = edges_around(positions, faces)
     used = count > 0
     mean = length[used].sum() / max(count[used].sum(), 1)
     # divisors elsewhere: corners that all lie at one place still get a length

@@ -84,8 +84,8 @@ class Frame:
     ``averaged``: the covered camera rays that are averaged in it; ``deferred``: those that are not in the image
     yet, all of their pixels; None without any. ``crossed``: indices of the pixels that a silhouette
     crosses; ``edges``: its visible points, None without any; ``contrast``: c_in - c_out at them, premultiplied RGB
-    and coverage. ``meetings``, ``meetings_contrast``: the same of surfaces that run into each other, which only pairs
-    see.
+    and coverage. ``meetings``, ``meetings_contrast``: the same where surfaces run into each other, None unless pairs
+    or ``Quality.meetings`` look for that.
     """
 
     grid: Grid

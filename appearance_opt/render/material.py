@@ -14,7 +14,7 @@ import drjit as dr
 import mitsuba as mi
 
 from appearance_opt.render.brdf import MaterialSample
-from appearance_opt.render.math import at_least, unit
+from appearance_opt.render.math import unit
 
 # not only for the type checker: Dr.Jit resolves the annotations of data classes when it looks for arrays
 from appearance_opt.render.texture import Pyramid
@@ -23,10 +23,10 @@ if TYPE_CHECKING:
     from appearance_opt.render.surface import Hit
 
 CHANNELS = ("red", "green", "blue", "roughness", "metalness", "normal_x", "normal_y", "normal_z", "gamma")
-"""Every channel a material can have. Colours are linear, normals in [-1, 1]; without ``normal_z`` it
-follows from unit length."""
+"""Every channel a material can have. Colours are linear, normals in [-1, 1], all three of their channels or none."""
 
 DEFAULTS = {"red": 0.5, "green": 0.5, "blue": 0.5, "roughness": 0.5, "metalness": 0.0}
+"""What a channel is that a material does not have; without "gamma" the BRDF has none."""
 
 
 @dataclass(frozen=True)
@@ -70,11 +70,7 @@ def evaluate(maps: MaterialMaps, hit: Hit) -> MaterialSample:
         base *= hit.color
     normal = None
     if maps.has_normal_map:
-        x, y = value["normal_x"], value["normal_y"]
-        z = value.get("normal_z")
-        if z is None:
-            z = dr.sqrt(at_least(1 - dr.fma(x, x, y * y), 0.01))
-        normal = mi.Vector3f(x, y, z)
+        normal = mi.Vector3f(value["normal_x"], value["normal_y"], value["normal_z"])
     return MaterialSample(base, value["roughness"], value["metalness"], normal, value.get("gamma"))
 
 

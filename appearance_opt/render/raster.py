@@ -3,8 +3,8 @@
 Every triangle visits its pixels, row by row. Where it covers the sample, the bits of its depth and its number go into
 the image as one number of 64 bits, of which the least stays: that of the nearest triangle. Edge functions are
 homogeneous (Olano and Greer 1997, Triangle Scan Conversion using 2D Homogeneous Coordinates), so that triangles that
-cross the plane of the camera need no clipping. Needs no BVH, and less time than tracing rays on a CPU as long as
-triangles are no smaller than pixels (docs/performance.md).
+cross the plane of the camera need no clipping. Needs no BVH, and less time than tracing rays on a CPU with fewer than
+``MOST_PER_PIXEL`` triangles to a pixel (docs/performance.md).
 """
 
 from __future__ import annotations

@@ -21,6 +21,7 @@ TILE = 4
 which makes tracing 30 % faster than scan lines (measured)."""
 
 MISS = 0xFFFFFFFF
+"""Number of the triangle of a ray that hits none."""
 
 
 @dataclass

@@ -31,8 +31,8 @@ class Surface:
     ``faces`` (4 F): three vertex indices and a material index. ``vertices`` (8 V): position, 0,
     normal, 0. ``corners`` (4 F): three indices into ``frames`` and 0, or None where they equal the
     vertex indices. ``frames`` (8 R): u, v, handedness, 0, tangent, 0; or (2 R): u, v without a normal
-    map; or None without texture coordinates. ``colors`` (4 V): linear vertex colour, 0, or None.
-    ``vertices`` and ``frames`` may carry gradients.
+    map (``has_tangents`` is False then); or None without texture coordinates. ``colors`` (4 V): linear
+    vertex colour, 0, or None. ``vertices`` and ``frames`` may carry gradients.
     """
 
     faces: mi.UInt32
@@ -81,16 +81,18 @@ def interpolate(surface: Surface, camera: Camera, samples: Samples, resolution: 
     b1 = clamp(dr.dot(o, q) * inverse, -SLACK, 1 + SLACK)
     r = dr.cross(o, e1)
     b2 = clamp(dr.dot(d, r) * inverse, -SLACK, 1 + SLACK)
-    depth = dr.dot(e2, r) * inverse
+    depth = dr.detach(dr.dot(e2, r) * inverse)
 
     facing = dr.detach(dr.cross(e1, e2))
     length = dr.norm(d)
     cosine = dr.dot(facing, d) / (length * at_least(dr.norm(facing), 1e-30))
-    if dr.grad_enabled(b1, b2, depth):
+    if dr.grad_enabled(b1, b2):
         share = at_most(dr.abs(cosine) * (1 / EDGE_ON_COSINE), 1)
-        b1, b2, depth = (dr.detach(x) + share * (x - dr.detach(x)) for x in (b1, b2, depth))
-    hit = Hit(dr.fma(d, depth, camera.eye), mi.Vector3f(0), d / -length, face[3])
-    pixel = dr.detach(depth) * (2 * width / resolution) * dr.norm(camera.right)
+        b1, b2 = (dr.detach(x) + share * (x - dr.detach(x)) for x in (b1, b2))
+    # from the corners, not along the ray: that is within the triangle whatever became of the depth
+    position = dr.fma(e1, b1, dr.fma(e2, b2, p[0]))
+    hit = Hit(position, mi.Vector3f(0), d / -length, face[3])
+    pixel = depth * (2 * width / resolution) * dr.norm(camera.right)
     area = dr.square(pixel) / at_least(dr.abs(cosine), GRAZING_COSINE)
     _attributes(hit, surface, samples.triangle, face, rows, b1, b2, facing, area)
     # the back of a triangle is seen: turning the normal over also turns the bitangent, which the sign of
