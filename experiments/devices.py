@@ -52,7 +52,7 @@ def arrays() -> dict[str, NDArray[np.float32]]:
     target = Targets(backend.to_device(out["reference image"]))
     inputs = StepInputs(views, target, np.full((VIEWS, 3), 0.3, np.float32), 0.0, 1.0, 0)
     for visibility in ("edges", "pairs"):
-        quality = Quality(1.0, 4, 1, visibility=visibility)
+        quality = Quality(visibility=visibility)
         loss, gradients = Gradients(model, grid, quality, LOSSES["log-srgb-l1"])(inputs)
         out[f"loss ({visibility})"] = np.array(loss)
         out |= {f"gradient of {name} ({visibility})": np.array(g) for name, g in gradients.items()}

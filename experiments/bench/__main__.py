@@ -21,6 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from appearance_opt import backend
+from experiments.bench.projective import projective
 
 OUT = Path("out")
 
@@ -41,7 +42,11 @@ def main() -> None:
     print(table(rows))
     print(growth(rows))
     if not a.quick:
-        rows["direct_projective"] = {"milliseconds": projective(rows)}
+        rows["direct_projective"] = projective()
+        peer, ours = rows["direct_projective"]["milliseconds"], rows["256"]["milliseconds"]
+        print(
+            f"\ndirect_projective, 16 spp, vertex gradient alone, 4 x 256^2: {peer:.0f} ms, {peer / ours:.0f} x a step"
+        )
     OUT.mkdir(exist_ok=True)
     (OUT / "bench.json").write_text(json.dumps(rows, indent=1))
 
@@ -95,12 +100,11 @@ def run_case(
     mesh = model.topology.mesh
     laplacian = Laplacian(mesh.positions, mesh.faces, model.edge_length, relative=True)
     moments = {n: adam.moments_of(p) for n, p in model.parameters.items()}
-    gradients = Gradients(model, grid, Quality(1.0, 4, 1), LOSSES["log-srgb-l1"], {0: laplacian})
+    width = point_width(resolution, maps)
+    gradients = Gradients(model, grid, Quality(point_width=width), LOSSES["log-srgb-l1"], {0: laplacian})
     views = [sampler.draw(k, 4) for k in range(8)]
     kept = [Targets(source.render_device(v.records(), grid, 1)) for v in views]
-    pool = ReferencePool(
-        source, sampler, 8, 4, resolution, POOL_SAMPLES, point_width(resolution, maps), CommonOptions.reuse
-    )
+    pool = ReferencePool(source, sampler, 8, 4, resolution, POOL_SAMPLES, width, CommonOptions.reuse)
     at_once = CommonOptions.reuse if images == "as in a fit" else 1
 
     def one(k: int) -> None:
@@ -152,51 +156,6 @@ def timings(one: Callable[[int], None], steps: int, at_once: int) -> dict:
         "kernels": float(np.median(kernels)),
         "compiled": int(compiled),
     }
-
-
-def projective(rows: dict) -> float:
-    """Milliseconds of Mitsuba's ``direct_projective`` at 16 samples per pixel for the vertex gradient of one
-    4 x 256^2 batch of a diffuse mesh of the same size: the gradient alone."""
-    import drjit as dr
-    import mitsuba as mi
-
-    from appearance_opt.initial.sphere import sphere
-
-    mi.set_log_level(mi.LogLevel.Error)  # it warns in every call that nothing is seen indirectly
-    low = sphere(3000, (0.0, 0.0, 0.0), 0.93, 64)
-    mesh = mi.Mesh("m", len(low.positions), len(low.faces))
-    p = mi.traverse(mesh)
-    p["vertex_positions"], p["faces"] = mi.Float(low.positions.ravel()), mi.UInt32(low.faces.astype(np.uint32).ravel())
-    p.update()
-    light = {"type": "point", "position": [2, 3, 5], "intensity": {"type": "rgb", "value": 40.0}}
-    scene = mi.load_dict({"type": "scene", "mesh": mesh, "light": light})
-    sensor = mi.load_dict(
-        {
-            "type": "perspective",
-            "fov": 32.0,
-            "to_world": mi.ScalarTransform4f().look_at([0, 0, 4], [0, 0, 0], [0, 1, 0]),
-            "film": {"type": "hdrfilm", "width": 256, "height": 256},
-        }
-    )
-    integrator = mi.load_dict({"type": "direct_projective"})
-    parameters = mi.traverse(scene)
-    key = next(k for k in parameters.keys() if k.endswith("vertex_positions"))  # noqa: SIM118
-    times = []
-    for k in range(5):
-        dr.enable_grad(parameters[key])
-        parameters.update()
-        dr.sync_thread()
-        began = time.perf_counter()
-        for view in range(4):
-            image = mi.render(scene, parameters, sensor=sensor, integrator=integrator, spp=16, seed=4 * k + view)
-            dr.backward(dr.mean(dr.square(image), axis=None))
-        dr.eval(dr.grad(parameters[key]))
-        dr.sync_thread()
-        times.append(1e3 * (time.perf_counter() - began))
-    value = float(np.median(times[1:]))
-    print(f"\ndirect_projective, 16 spp, gradient alone, 4 x 256^2: {value:.0f} ms; ", end="")
-    print(f"{value / rows['256']['milliseconds']:.0f} x a whole step of ours")
-    return value
 
 
 def table(rows: dict) -> str:

@@ -18,6 +18,7 @@ from appearance_opt import backend
 from appearance_opt.fit import adam
 from appearance_opt.fit.losses import LOSSES, Target, compared_pixels, covered_loss, image_loss
 from appearance_opt.fit.model import POSITIONS, TEXELS, Shape
+from appearance_opt.jobs.fitting import point_width
 from appearance_opt.render import gradient
 from appearance_opt.render.deferred import Grid
 from appearance_opt.render.freezing import Frozen
@@ -59,7 +60,7 @@ class Stopwatch:
 def stages(resolution: int, maps: int) -> dict[str, float]:
     """Median milliseconds of each stage."""
     source, model, sampler = set_up(3000, 100_000, maps)
-    grid, quality = Grid(4, resolution), Quality(1.0, 4, 1)
+    grid, quality = Grid(4, resolution), Quality(point_width=point_width(resolution, maps))
     records = sampler.draw(0, 4).records()
     reference = source.render_device(records, grid, 1)
     edges = model.topology.edges

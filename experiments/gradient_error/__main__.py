@@ -41,6 +41,7 @@ SETTINGS = {
     "pairs, 2 x 2": Quality(samples=4, visibility="pairs"),
     "pairs, 4 x 4": Quality(samples=16, visibility="pairs"),
     "edges 1, 4 rays": Quality(1.0, 4, 1),
+    "edges 1, 8 rays (default)": Quality(),
     "edges 2, 4 rays": Quality(2.0, 4, 1),
     "edges 4, 8 rays": Quality(4.0, 8, 1),
     "edges 4, 8 rays, meetings": Quality(4.0, 8, 1, meetings=True),
@@ -49,7 +50,8 @@ SETTINGS = {
     "edges 8, 16 rays, 2 x 2, meetings": Quality(8.0, 16, 4, meetings=True),
     "edges 16, 64 rays, 4 x 4": Quality(16.0, 64, 16),
 }
-"""Edges: silhouette points per pixel of silhouette, rays per pixel that a silhouette crosses, rays in the others."""
+"""Edges: silhouette points per pixel of silhouette, rays per pixel that a silhouette crosses, rays in the others (one
+where nothing is said)."""
 
 PEERS = [("direct_projective", s) for s in (4, 16, 64)] + [("prb_projective", 16)]
 SIZES = [("spot-1k", 64), ("spot-1k", 128), ("spot-1k", 256), ("spot-1k", 512), ("spot-6k", 256), ("spot-94k", 256)]
