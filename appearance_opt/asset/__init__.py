@@ -21,14 +21,17 @@ def load(
     variants: dict[str, str] | None = None,
     missing_textures: MissingTextures = "error",
     root: str | Path | None = None,
+    keep_layout: bool = False,
 ) -> Asset:
     """Read an asset; the suffix chooses the format. Units become metres, the up axis +Y.
 
     ``refine``: level to which USD subdivision surfaces are refined. ``variants``: USD variant
     selections by set name, instead of those in the file. ``missing_textures``: "error" refuses an asset that names
     a texture file which is not there, "ignore" goes on with the material's constants (without a normal map, if it is
-    that) and a note. ``root``: folder in which files that it refers to may lie, beside its own. Harmless faults
-    are repaired and noted in ``Asset.notes``. Raises InputError for everything else, naming the file.
+    that) and a note. ``root``: folder in which files that it refers to may lie, beside its own. ``keep_layout``:
+    for a mesh to be baked onto, whose vertices and texture coordinates stay as the file has them: no transform of a
+    texture is applied to them, and a glTF mesh without normals is not taken apart into flat triangles. Harmless
+    faults are repaired and noted in ``Asset.notes``. Raises InputError for everything else, naming the file.
     """
     path = Path(path)
     if missing_textures not in CHOICES:
@@ -48,27 +51,29 @@ def load(
         # numbers that do not fit a float32 become infinite, which ``repair`` refuses by name
         with np.errstate(over="ignore", invalid="ignore"):
             companions = Companions(missing_textures, None if root is None else Path(root))
-            return repair(_read(path, suffix, refine, variants, companions), str(path))
+            return repair(_read(path, suffix, refine, variants, companions, keep_layout), str(path))
     except MemoryError as error:
         raise InputError(f"{path}: asks for more memory than there is; it is damaged or too large") from error
 
 
-def _read(path: Path, suffix: str, refine: int, variants: dict[str, str] | None, companions: Companions) -> Asset:
+def _read(
+    path: Path, suffix: str, refine: int, variants: dict[str, str] | None, companions: Companions, keep_layout: bool
+) -> Asset:
     if suffix in (".glb", ".gltf"):
         from appearance_opt.asset.gltf_read import load_gltf
 
-        return load_gltf(path, companions)
+        return load_gltf(path, companions, keep_layout)
     if suffix == ".obj":
         from appearance_opt.asset.obj import load_obj
 
-        return load_obj(path, companions)
+        return load_obj(path, companions, keep_layout)
     if suffix in (".ply", ".stl"):
         from appearance_opt.asset.geometry import load_geometry
 
         return load_geometry(path)
     from appearance_opt.asset.usd_read import load_usd
 
-    return load_usd(path, refine, variants, companions)
+    return load_usd(path, refine, variants, companions, keep_layout)
 
 
 def save(asset: Asset, path: str | Path) -> None:

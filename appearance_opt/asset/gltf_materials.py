@@ -46,15 +46,17 @@ class MaterialReader:
             self._materials[index] = Material() if index is None else self._read_material(index)
         return self._materials[index], channels[0] if channels else 0
 
-    def in_one_frame(self, meshes: list[Mesh]) -> list[Mesh]:
-        """KHR_texture_transform applied, and textures brought under one transform and wrap mode where they differ."""
+    def in_one_frame(self, meshes: list[Mesh], keep_layout: bool = False) -> list[Mesh]:
+        """KHR_texture_transform applied, and textures brought under one transform and wrap mode where they differ;
+        or all as it is (``keep_layout``: see ``asset.load``)."""
         frames_of = {}
         for index, material in self._materials.items():
             extensions = {n: info.get("extensions", {}) for n, info in self._texture_infos(index).items()}
             frames_of[id(material)] = {
                 n: uv_frames.affine(e.get("KHR_texture_transform")) for n, e in extensions.items()
             }
-        return uv_frames.unified(meshes, frames_of, self.note)
+        place = uv_frames.kept if keep_layout else uv_frames.unified
+        return place(meshes, frames_of, self.note)
 
     def _texture_infos(self, index: int | None) -> dict[str, dict[str, Any]]:
         """What a material says of its textures, by the name of ours."""

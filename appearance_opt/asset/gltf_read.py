@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,6 +12,8 @@ from appearance_opt.asset.gltf_accessors import Document
 from appearance_opt.asset.gltf_draco import DRACO, Compressed
 from appearance_opt.asset.gltf_materials import READ_EXTENSIONS, MaterialReader
 from appearance_opt.asset.gltf_meshopt import MESHOPT
+from appearance_opt.asset.gltf_nodes import INSTANCING, Nodes, Placement, local_transform
+from appearance_opt.asset.normals import unit
 from appearance_opt.asset.types import Asset, Mesh
 from appearance_opt.errors import InputError
 
@@ -20,24 +23,28 @@ if TYPE_CHECKING:
     from appearance_opt.asset.companions import Companions
 
 _COMPRESSED = {"KHR_texture_basisu": "Basis Universal"}
-_HARMLESS = {DRACO, *MESHOPT, "KHR_mesh_quantization", *READ_EXTENSIONS}
+_READ = {DRACO, *MESHOPT, INSTANCING, "KHR_mesh_quantization", *READ_EXTENSIONS}
+_VISUAL = ("KHR_materials_", "KHR_lights_", "EXT_lights_", "KHR_animation_pointer", "KHR_xmp_json_ld")
+"""Extensions, by the start of their names, without which shapes and textures are the same: lobes of materials, and
+lights. They are ignored with a note even where a file calls them required."""
 
 
-def load_gltf(path: Path, companions: Companions) -> Asset:
-    """Read a .gltf or .glb file. Raises InputError."""
+def load_gltf(path: Path, companions: Companions, keep_layout: bool = False) -> Asset:
+    """Read a .gltf or .glb file. ``keep_layout``: see ``asset.load``. Raises InputError."""
     document = Document(path, companions)
     try:
-        return _Reader(document).asset()
+        return _Reader(document, keep_layout).asset()
     except (KeyError, IndexError, TypeError, AttributeError, ValueError, OverflowError, RecursionError) as error:
         raise InputError(f"{path}: the glTF structure is broken ({type(error).__name__}: {error})") from error
 
 
 class _Reader:
-    def __init__(self, document: Document) -> None:
-        self.document = document
+    def __init__(self, document: Document, keep_layout: bool) -> None:
+        self.document, self.keep_layout = document, keep_layout
         self.path = document.path
         self.note = document.companions.note
         self.materials = MaterialReader(document)
+        self.nodes = Nodes(document)
 
     def asset(self) -> Asset:
         self._check_extensions()
@@ -48,10 +55,14 @@ class _Reader:
         meshes: list[Mesh] = []
         for root in roots:
             self._visit(root, np.eye(4), meshes, set())
-        for kind, what in (("skins", "skins (bind pose kept)"), ("animations", "animations")):
+        for kind, what in (
+            ("skins", "skins: the rest pose is kept, skinning dropped"),
+            ("animations", "animations dropped"),
+        ):
             if self.document.items(kind):
-                self.note(f"{what} ignored")
-        return Asset(tuple(self.materials.in_one_frame(meshes)), self.path.stem, tuple(self.document.companions.notes))
+                self.note(what)
+        meshes = self.materials.in_one_frame(meshes, self.keep_layout)
+        return Asset(tuple(meshes), self.path.stem, tuple(self.document.companions.notes))
 
     def _check_extensions(self) -> None:
         for name in self.document.json.get("extensionsRequired", []):
@@ -59,30 +70,33 @@ class _Reader:
                 raise InputError(
                     f"{self.path}: {_COMPRESSED[name]} compression is not supported; save it uncompressed first"
                 )
+            if name not in _READ and not str(name).startswith(_VISUAL):
+                raise InputError(
+                    f"{self.path}: requires the extension '{name}', which is not supported; save it without"
+                )
         for name in self.document.json.get("extensionsUsed", []):
-            if name not in _HARMLESS:
+            if name not in _READ:
                 self.note(f"extension {name} ignored")
 
     def _visit(self, index: int, parent: NDArray, meshes: list[Mesh], seen: set[int]) -> None:
         if index in seen:
             raise InputError(f"{self.path}: node {index} is its own ancestor")
         node = self.document.items("nodes")[index]
-        world = parent @ _local_transform(node)
+        world = parent @ local_transform(node)
         if "mesh" in node:
             mesh = self.document.items("meshes")[node["mesh"]]
             name = node.get("name") or mesh.get("name") or f"mesh{node['mesh']}"
             for k, primitive in enumerate(mesh["primitives"]):
-                part = self._primitive(primitive, world, name if k == 0 else f"{name}.{k}")
-                if part is not None:
-                    meshes.append(part)
+                meshes += self._primitive(primitive, node, world, name if k == 0 else f"{name}.{k}")
         for child in node.get("children", []):
             self._visit(child, world, meshes, seen | {index})
 
-    def _primitive(self, primitive: dict[str, Any], world: NDArray, name: str) -> Mesh | None:
+    def _primitive(self, primitive: dict[str, Any], node: dict[str, Any], world: NDArray, name: str) -> list[Mesh]:
+        """The meshes of a primitive, one for each place at which its node puts it."""
         mode = primitive.get("mode", 4)
         if mode not in (4, 5, 6):
             self.note("points and lines ignored")
-            return None
+            return []
         if primitive.get("targets"):
             self.note("morph targets ignored")
         attributes = primitive["attributes"]
@@ -100,46 +114,76 @@ class _Reader:
             accessor = primitive.get("indices")
             indices = np.arange(len(positions)) if accessor is None else self.document.accessor(accessor)[:, 0]
             faces = _triangles(indices.astype(np.int64), mode)
-        linear = world[:3, :3]
-        if np.linalg.det(linear) < 0:
-            faces = faces[:, ::-1]
         normals = tangents = colors = None
         if "NORMAL" in attributes:
-            normals = _normalized(read("NORMAL").astype(np.float64) @ _cofactor(linear).T)
-        if "TANGENT" in attributes and normals is not None:
-            t = read("TANGENT").astype(np.float64)
-            tangents = np.concatenate([_normalized(t[:, :3] @ linear.T), np.where(t[:, 3:4] < 0, -1, 1)], axis=1)
+            normals = read("NORMAL").astype(np.float64)
+            tangents = read("TANGENT").astype(np.float64) if "TANGENT" in attributes else None
         if "COLOR_0" in attributes:
             colors = read("COLOR_0")[:, :3].astype(np.float32)
         material, channel = self.materials.read(primitive.get("material"))
-        uvs = read(f"TEXCOORD_{channel}") if f"TEXCOORD_{channel}" in attributes else None
-        return Mesh(
-            positions=(positions @ linear.T + world[:3, 3]).astype(np.float32),
-            faces=np.ascontiguousarray(faces, np.int32),
-            normals=_float(normals),
-            uvs=_float(uvs),
-            tangents=_float(tangents),
-            colors=colors,
-            material=material,
-            name=name,
-        )
+        uvs = _float(read(f"TEXCOORD_{channel}")) if f"TEXCOORD_{channel}" in attributes else None
+        if "skin" in node and "JOINTS_0" in attributes:
+            places = [self.nodes.skinned(node["skin"], attributes, read)]
+        else:
+            places = self.nodes.placements(node, world)
+        local = Mesh(positions, faces, normals, uvs, tangents, colors, material, name)  # type: ignore[arg-type]
+        meshes = [_placed(local, place) for place in places]
+        if normals is None and not self.keep_layout:
+            self.note("meshes without normals are shaded flat, as glTF 2.0 asks")
+            meshes = [_flat(m) for m in meshes]
+        return meshes
 
 
-def _local_transform(node: dict[str, Any]) -> NDArray:
-    if "matrix" in node:
-        return np.array(node["matrix"], np.float64).reshape(4, 4).T
-    x, y, z, w = (float(q) for q in node.get("rotation", (0, 0, 0, 1)))
-    out = np.eye(4)
-    rotation = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
+def _placed(mesh: Mesh, place: Placement) -> Mesh:
+    """A mesh, still in double precision, at its place in the world."""
+    faces, mirrors = mesh.faces, place.mirrors(len(mesh.positions))
+    if mirrors.any():
+        turned = mirrors[faces[:, 0]][:, None]
+        faces = np.where(turned, faces[:, ::-1], faces)
+    normals, tangents = mesh.normals, mesh.tangents
+    if normals is not None:
+        normals = _float(_normalized(place.normals(normals)))
+    if tangents is not None:
+        # a reflection turns cross(normal, tangent) over, but not the bitangent
+        w = np.where((tangents[:, 3:4] < 0) != mirrors[:, None], -1, 1)
+        tangents = _float(np.concatenate([_normalized(place.directions(tangents[:, :3])), w], axis=1))
+    return replace(
+        mesh,
+        positions=place.points(mesh.positions).astype(np.float32),
+        faces=np.ascontiguousarray(faces, np.int32),
+        normals=normals,
+        tangents=tangents,
     )
-    out[:3, :3] = rotation * np.array(node.get("scale", (1, 1, 1)), np.float64)
-    out[:3, 3] = node.get("translation", (0, 0, 0))
-    return out
+
+
+def _flat(mesh: Mesh) -> Mesh:
+    """The mesh with its faces' normals: "When normals are not specified, client implementations MUST calculate flat
+    normals and the provided tangents (if present) MUST be ignored" (glTF 2.0, 3.7.2.1). Where faces of different
+    normals meet, each corner gets a vertex of its own."""
+    corners = mesh.faces.ravel()
+    if len(corners) and (corners.min() < 0 or corners.max() >= len(mesh.positions)):
+        return mesh  # refused by ``repair``, which counts them
+    p = mesh.positions[mesh.faces].astype(np.float64)
+    with np.errstate(all="ignore"):
+        normal = unit(np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0])).astype(np.float32)
+    normal = np.repeat(normal, 3, axis=0)
+    some = np.zeros((len(mesh.positions), 3), np.float32)  # the normal of some face of each vertex
+    some[corners] = normal
+    disagree = (some[corners] != normal).any(axis=1)
+    shared = np.bincount(corners[disagree], minlength=len(some)) == 0
+    split = ~shared[corners]
+    index = np.concatenate([np.flatnonzero(shared), corners[split]])
+    faces = (np.cumsum(shared) - 1)[corners]
+    faces[split] = int(shared.sum()) + np.arange(int(split.sum()))
+    return replace(
+        mesh,
+        positions=mesh.positions[index],
+        faces=faces.reshape(-1, 3).astype(np.int32),
+        normals=np.concatenate([some[shared], normal[split]]),
+        uvs=None if mesh.uvs is None else mesh.uvs[index],
+        colors=None if mesh.colors is None else mesh.colors[index],
+        tangents=None,
+    )
 
 
 def _triangles(indices: NDArray, mode: int) -> NDArray:
@@ -152,12 +196,6 @@ def _triangles(indices: NDArray, mode: int) -> NDArray:
     strip = np.stack([indices[:n], indices[1 : n + 1], indices[2 : n + 2]], axis=1)
     strip[1::2] = strip[1::2, [1, 0, 2]]
     return strip
-
-
-def _cofactor(m: NDArray) -> NDArray:
-    """Transforms normals, singular matrices included (inverse transpose times determinant, sign kept)."""
-    c = np.stack([np.cross(m[1], m[2]), np.cross(m[2], m[0]), np.cross(m[0], m[1])])
-    return c if np.linalg.det(m) >= 0 else -c
 
 
 def _normalized(v: NDArray) -> NDArray:

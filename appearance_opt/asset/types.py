@@ -126,14 +126,11 @@ class Mesh:
 @dataclass(frozen=True)
 class Asset:
     """All meshes of one file, node transforms applied. ``notes`` lists, one line each, what the
-    loader dropped, repaired or assumed. ``up_axis`` and ``metres_per_unit`` are those of the file
-    the asset came from; the data itself is +Y up, in metres."""
+    loader dropped, repaired or assumed."""
 
     meshes: tuple[Mesh, ...]
     name: str = "asset"
     notes: tuple[str, ...] = ()
-    up_axis: Literal["X", "Y", "Z"] = "Y"
-    metres_per_unit: float = 1.0
 
     @property
     def triangle_count(self) -> int:

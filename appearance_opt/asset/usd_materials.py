@@ -174,9 +174,11 @@ class MaterialReader:
         self.frames[id(out)] = {n: _frame(node) for n, node in nodes.items() if node}
         return out
 
-    def in_one_frame(self, meshes: list[Mesh]) -> list[Mesh]:
-        """Texture transforms applied, and textures brought under one transform and wrap mode where they differ."""
-        return uv_frames.unified(meshes, self.frames, self.note)
+    def in_one_frame(self, meshes: list[Mesh], keep_layout: bool = False) -> list[Mesh]:
+        """Texture transforms applied, and textures brought under one transform and wrap mode where they differ; or all
+        as it is (``keep_layout``: see ``asset.load``)."""
+        place = uv_frames.kept if keep_layout else uv_frames.unified
+        return place(meshes, self.frames, self.note)
 
     def _scaled(
         self, node: Any, space: str, channel: str, constant: tuple[float, float, float]

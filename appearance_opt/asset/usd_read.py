@@ -36,10 +36,11 @@ def load_usd(
     refine: int = 1,
     variants: dict[str, str] | None = None,
     companions: Companions | None = None,
+    keep_layout: bool = False,
 ) -> Asset:
     """Read a stage at its earliest time, variants at their selection (or as ``variants`` says: set name ->
-    variant, on the default prim). Catmull-Clark and Loop meshes are refined ``refine`` times. Raises
-    InputError."""
+    variant, on the default prim). Catmull-Clark and Loop meshes are refined ``refine`` times.
+    ``keep_layout``: see ``asset.load``. Raises InputError."""
     from pxr import Tf, UsdUtils
 
     path = Path(path)
@@ -47,7 +48,7 @@ def load_usd(
     # USD prints what it warns of; here it becomes notes
     diagnostics = UsdUtils.CoalescingDiagnosticDelegate()
     try:
-        asset = _read_stage(path, refine, variants or {}, companions or Companions())
+        asset = _read_stage(path, refine, variants or {}, companions or Companions(), keep_layout)
     except Tf.ErrorException as error:
         raise InputError(f"{path}: not a readable USD file ({_text(error.__str__)})") from None
     except (KeyError, IndexError, TypeError, ValueError, RuntimeError, OverflowError) as error:
@@ -57,7 +58,7 @@ def load_usd(
     return replace(asset, notes=asset.notes + tuple(f"USD: {text}" for text in dict.fromkeys(warned)))
 
 
-def _read_stage(path: Path, refine: int, variants: dict[str, str], companions: Companions) -> Asset:
+def _read_stage(path: Path, refine: int, variants: dict[str, str], companions: Companions, keep_layout: bool) -> Asset:
     from pxr import Usd
 
     stage = Usd.Stage.Open(str(path))
@@ -65,7 +66,7 @@ def _read_stage(path: Path, refine: int, variants: dict[str, str], companions: C
         raise InputError(f"{path}: not a readable USD file")
     _select(stage, variants, path)
     _refuse_escapes(stage, path, companions)
-    return _Reader(stage, path, refine, companions).asset()
+    return _Reader(stage, path, refine, companions).asset(keep_layout)
 
 
 def _select(stage: Any, variants: dict[str, str], path: Path) -> None:
@@ -111,15 +112,13 @@ class _Reader:
 
         self.stage, self.path, self.refine = stage, path, refine
         self.companions, self.note = companions, companions.note
-        self.up = str(UsdGeom.GetStageUpAxis(stage))
-        self.unit = _metres_per_unit(stage)
-        self.to_metres = _TO_Y_UP[self.up] * self.unit
+        self.to_metres = _TO_Y_UP[str(UsdGeom.GetStageUpAxis(stage))] * _metres_per_unit(stage)
         self.materials = MaterialReader(stage, path, companions)
         # the first frame of what is animated
         self.time = Usd.TimeCode.EarliestTime()
         self.cache = UsdGeom.XformCache(self.time)
 
-    def asset(self) -> Asset:
+    def asset(self, keep_layout: bool) -> Asset:
         from pxr import Usd, UsdGeom
 
         meshes: list[Mesh] = []
@@ -132,8 +131,8 @@ class _Reader:
                 geometry = self._geometry(prim)
                 if geometry is not None:
                     meshes += self._split(prim, geometry, self.cache.GetLocalToWorldTransform(prim))
-        meshes = self.materials.in_one_frame(meshes)
-        return Asset(tuple(meshes), self.path.stem, tuple(self.companions.notes), self.up, self.unit)  # type: ignore[arg-type]
+        meshes = self.materials.in_one_frame(meshes, keep_layout)
+        return Asset(tuple(meshes), self.path.stem, tuple(self.companions.notes))
 
     def _shown(self, prim: Any) -> bool:
         from pxr import UsdGeom
