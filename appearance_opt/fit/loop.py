@@ -21,6 +21,7 @@ from appearance_opt.fit.validation import Validation
 from appearance_opt.latent.displacement import DISPLACEMENT
 from appearance_opt.latent.latent import local_edge_length
 from appearance_opt.render.deferred import Grid
+from appearance_opt.render.display import BACKGROUND as GREY
 from appearance_opt.render.gradient import Quality
 
 if TYPE_CHECKING:
@@ -38,6 +39,9 @@ LOOKING = 0.1
 
 LOSS_EVERY = 8
 """Steps between two evaluations of the loss: it is only shown, the gradient does not need it."""
+
+FIXED_BACKGROUNDS = {"black": (0.0,) * 3, "white": (1.0,) * 3, "grey": (GREY,) * 3}
+"""Linear RGB."""
 
 Background = str | tuple[float, float, float]
 """random, black, white, grey, or linear RGB."""
@@ -293,6 +297,5 @@ def backgrounds(background: Background, count: int, seed: int, iteration: int) -
     visible, whatever the colour of the object."""
     if background == "random":
         return np.random.default_rng([seed, 7, iteration]).random((count, 3)).astype(np.float32)
-    fixed = {"black": (0.0,) * 3, "white": (1.0,) * 3, "grey": (0.18,) * 3}
-    color = fixed[background] if isinstance(background, str) else background
+    color = FIXED_BACKGROUNDS[background] if isinstance(background, str) else background
     return np.tile(np.asarray(color, np.float32), (count, 1))

@@ -10,6 +10,7 @@ from appearance_opt.asset.normals import split_where_cancelled, summed_normals
 from appearance_opt.asset.packing import EMISSION, pack_emission
 from appearance_opt.asset.tangents import split_and_tangents
 from appearance_opt.asset.types import Asset, Material, Mesh, Texture
+from appearance_opt.render.material import DEFAULTS
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -58,6 +59,9 @@ def _material(maps: Mapping[str, NDArray | float], name: str, double_sided: bool
         r, g, b = (float(maps.get(n, 0.0)) for n in names)
         return r, g, b
 
+    def constant(channel: str) -> float:
+        return float(maps.get(channel, DEFAULTS[channel]))
+
     base = stacked("red", "green", "blue")
     rough_metal = stacked("roughness", "metalness")
     normal = stacked("normal_x", "normal_y", "normal_z")
@@ -68,13 +72,13 @@ def _material(maps: Mapping[str, NDArray | float], name: str, double_sided: bool
         normal = normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-6)
     emitted = stacked(*EMISSION)
     emission, emission_texture = pack_emission(emitted) if emitted is not None else (numbers(*EMISSION), None)
-    color = tuple(float(maps.get(c, 0.5)) if base is None else 1.0 for c in ("red", "green", "blue"))
+    color = tuple(constant(c) if base is None else 1.0 for c in ("red", "green", "blue"))
     clamp = ("clamp", "clamp")
     return Material(
         name=name,
         base_color=color,  # type: ignore[arg-type]
-        roughness=1.0 if orm is not None else float(maps.get("roughness", 0.5)),
-        metalness=1.0 if orm is not None else float(maps.get("metalness", 0.0)),
+        roughness=1.0 if orm is not None else constant("roughness"),
+        metalness=1.0 if orm is not None else constant("metalness"),
         base_color_texture=None if base is None else Texture(_srgb8(base), "srgb", clamp),  # type: ignore[arg-type]
         orm_texture=None if orm is None else Texture(_8(orm), "linear", clamp),  # type: ignore[arg-type]
         normal_texture=None if normal is None else Texture(_8(normal * 0.5 + 0.5), "linear", clamp),  # type: ignore[arg-type]

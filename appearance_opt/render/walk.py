@@ -9,6 +9,7 @@ import mitsuba as mi
 
 from appearance_opt.render import rays, silhouette
 from appearance_opt.render.deferred import Grid, pixel_index
+from appearance_opt.render.outlines import NOTHING
 from appearance_opt.render.rays import MISS, Samples
 from appearance_opt.render.silhouette import EdgeList
 from appearance_opt.render.weighted import concat, joined
@@ -50,7 +51,7 @@ def neighbours(hits: Samples, depth: mi.Float, fine: Grid) -> Neighbours | None:
     index = pixel_index(hits, fine.rows)
     triangles, depths = dr.empty(mi.UInt32, fine.pixels), dr.empty(mi.Float, fine.pixels)
     dr.scatter(triangles, hits.triangle, index, mode=dr.ReduceMode.Permute)
-    dr.scatter(depths, dr.select(hits.triangle == MISS, mi.Float(1e30), depth), index, mode=dr.ReduceMode.Permute)
+    dr.scatter(depths, dr.select(hits.triangle == MISS, mi.Float(NOTHING), depth), index, mode=dr.ReduceMode.Permute)
     dr.eval(triangles, depths)
     found = []
     for horizontal in (True, False):
