@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from pathlib import Path
+from pathlib import Path, PureWindowsPath
 from typing import TYPE_CHECKING, Literal, TypeVar, get_args
+from urllib.parse import unquote
 
 from appearance_opt.asset.paths import resolve
 from appearance_opt.errors import InputError, MissingFileError
@@ -35,8 +36,30 @@ class Companions:
             self.notes.append(text)
 
     def find(self, reference: str, owner: Path, percent_encoded: bool = False) -> Path:
-        """Path of a file that ``owner`` refers to. Raises InputError as ``resolve`` does."""
-        return resolve(reference, owner, percent_encoded, self.root)
+        """Path of a file that ``owner`` refers to. Raises InputError as ``resolve`` does.
+
+        An absolute path names a place on the machine that wrote the file: where it leads nowhere, or to where nothing
+        may be read, a file of the same name beside ``owner`` or in ``root`` stands for it, with a note.
+        """
+        try:
+            return resolve(reference, owner, percent_encoded, self.root)
+        except InputError:
+            path = PureWindowsPath(
+                unquote(reference) if percent_encoded else reference
+            )  # it takes both kinds of slashes
+            if not path.root:
+                raise
+        for folder in (owner.resolve().parent, *([] if self.root is None else [self.root.resolve()])):
+            try:
+                found = resolve(str(folder / path.name), owner, root=self.root)
+            except MissingFileError:
+                continue
+            self.note(f"'{reference}' is not there or not to be read: '{found.name}' in {folder} stands for it")
+            return found
+        raise MissingFileError(
+            f"{owner}: refers to '{reference[:200]}' outside its own folder, where there is no '{path.name[:80]}'; copy it "
+            "beside the file, or allow the folder with --root"
+        )
 
     def read(self, file: Callable[[], T], instead: str = "the material's constants stand alone") -> T | None:
         """What ``file`` reads; None if it is missing and that is to be ignored. ``instead``: what the note says
