@@ -57,8 +57,8 @@ class Companions:
             self.note(f"'{reference}' is not there or not to be read: '{found.name}' in {folder} stands for it")
             return found
         raise MissingFileError(
-            f"{owner}: refers to '{reference[:200]}' outside its own folder, where there is no '{path.name[:80]}'; copy it "
-            "beside the file, or allow the folder with --root"
+            f"{owner}: refers to '{reference[:200]}' outside its own folder, where there is no '{path.name[:80]}'; "
+            "copy it beside the file, or allow the folder with --root"
         )
 
     def read(self, file: Callable[[], T], instead: str = "the material's constants stand alone") -> T | None:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from appearance_opt import backend
-from appearance_opt.asset import save
+from appearance_opt.asset import load, save
 from appearance_opt.asset.paths import replacing
 from appearance_opt.errors import DivergedError, InputError
 
@@ -76,7 +76,7 @@ def bake(
     watch = Stopwatch(began)
     for source in (high, low):
         check_paths(source, out, report)
-    heavy, light = loaded(high, options, variants), loaded(low, options)
+    heavy, light = loaded(high, options, variants), _low(low, options)
     watch.lap("load")
     run = BakeJob(heavy, light, str(low) if isinstance(low, (str, Path)) else light.name, options, watch)
     result, error = run.run(progress, report is not None)
@@ -95,6 +95,14 @@ def bake(
 
     conclude(result, watch, None if report is None else write_report)
     return result
+
+
+def _low(source: str | Path | Asset, options: BakeOptions) -> Asset:
+    """LOW, with the vertices and texture coordinates of its file."""
+    if not isinstance(source, (str, Path)):
+        return source
+    given = {"missing_textures": options.missing_textures, "root": options.root}
+    return load(source, refine=options.refine, keep_layout=True, **given)  # type: ignore[arg-type]
 
 
 class BakeJob:
