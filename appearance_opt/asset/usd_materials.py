@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from appearance_opt.asset import images, uv_frames
+from appearance_opt.asset import images, specular_glossiness, uv_frames
 from appearance_opt.asset.materialx import load_materialx
 from appearance_opt.asset.packing import pack_orm
+from appearance_opt.asset.specular_glossiness import Specular
 from appearance_opt.asset.types import Material, Mesh, Texture
 from appearance_opt.errors import MissingFileError
 
@@ -32,47 +35,73 @@ class MaterialReader:
         self._materials: dict[str, Material] = {}
         self.frames: dict[int, dict[str, NDArray[np.float64]]] = {}
         self._pixels: dict[str, NDArray] = {}
+        self._by_side: dict[tuple[int, bool], Material] = {}
 
-    def bindings(self, prim: Any, mesh: Any, face_ids: NDArray) -> Iterator[tuple[Material, NDArray[np.bool_]]]:
-        """(material, mask of the triangles that wear it); ``face_ids``: face of the file of each triangle."""
-        from pxr import UsdGeom, UsdShade
+    def bindings(self, prim: Any, face_ids: NDArray) -> Iterator[tuple[Material, str, NDArray[np.bool_]]]:
+        """(material, primvar of its texture coordinates, mask of the triangles that wear it); ``face_ids``: face of the
+        file of each triangle."""
+        from pxr import UsdGeom
 
+        double = bool(UsdGeom.Gprim(prim).GetDoubleSidedAttr().Get())
         rest = np.ones(len(face_ids), bool)
-        api = UsdShade.MaterialBindingAPI(prim)
-        for subset in api.GetMaterialBindSubsets():
+        for subset in self._subsets(prim):
             faces = np.array(UsdGeom.Subset(subset).GetIndicesAttr().Get() or [], np.int64)
             mask = np.isin(face_ids, faces) & rest
             rest &= ~mask
-            yield self._bound(subset.GetPrim()), mask
+            yield self._sided(self._bound(subset), double), self._uv_name(prim, subset), mask
         if rest.any():
-            yield self._bound(prim), rest
+            yield self._sided(self._bound(prim), double), self._uv_name(prim, prim), rest
 
-    def uv_name(self, prim: Any) -> str:
-        """The primvar that holds texture coordinates: what the material reads, or the usual names."""
+    def uv_names(self, prim: Any) -> list[str]:
+        """The primvars that hold texture coordinates of a mesh, of which each of its materials reads one."""
+        subsets = self._subsets(prim)
+        wearers = [*subsets, *([prim] if not subsets or self._bound_prim(prim) else [])]
+        names = list(dict.fromkeys(self._uv_name(prim, w) for w in wearers))
+        if len(names) > 1:
+            self.note(f"'{prim.GetPath()}': its materials read texture coordinates of their own ({', '.join(names)})")
+        return names
+
+    def _subsets(self, prim: Any) -> list[Any]:
+        from pxr import UsdShade
+
+        return [s.GetPrim() for s in UsdShade.MaterialBindingAPI(prim).GetMaterialBindSubsets()]
+
+    def _uv_name(self, prim: Any, wearer: Any) -> str:
+        """What the material of ``wearer``, a mesh or a subset of it, reads, or the usual names."""
         from pxr import UsdGeom, UsdShade
 
         names = []
-        material = self._bound_prim(prim)
+        material = self._bound_prim(wearer)
         if material:
             for node in _descendants(material.GetPrim()):
                 shader = UsdShade.Shader(node)
                 if shader and str(shader.GetIdAttr().Get() or "").startswith("UsdPrimvarReader_float2"):
                     names.append(str(_value(shader.GetInput("varname")) or ""))
         api = UsdGeom.PrimvarsAPI(prim)
-        for name in [*names, "st", "UVMap", "map1", "uv"]:
-            if name and api.HasPrimvar(name):
-                return name
-        return "st"
+        read = [n for n in dict.fromkeys(names) if n and api.HasPrimvar(n)]
+        if len(read) > 1:
+            told = "use different texture coordinates: the first set is used for all"
+            self.note(f"material '{material.GetPrim().GetName()}': its textures {told}")
+        return next((n for n in (*read, "st", "UVMap", "map1", "uv") if api.HasPrimvar(n)), "st")
 
     def uses_display_color(self, prim: Any) -> bool:
         """Is displayColor what colours the mesh? (No material, or one that reads it.)"""
         from pxr import UsdShade
 
-        material = self._bound_prim(prim)
-        if not material:
+        materials = [m for m in (self._bound_prim(w) for w in (prim, *self._subsets(prim))) if m]
+        if not materials:
             return not self._unresolved(prim)
-        readers = (UsdShade.Shader(n) for n in _descendants(material.GetPrim()))
+        readers = (UsdShade.Shader(n) for m in materials for n in _descendants(m.GetPrim()))
         return any(r and str(_value(r.GetInput("varname"))) == "displayColor" for r in readers)
+
+    def _sided(self, material: Material, double: bool) -> Material:
+        """The material for meshes of which both sides are seen, or one: in USD the mesh says so."""
+        key = (id(material), double)
+        if key not in self._by_side:
+            one = material if material.double_sided == double else replace(material, double_sided=double)
+            self._by_side[key] = one
+            self.frames[id(one)] = self.frames.get(id(material), {})
+        return self._by_side[key]
 
     def _bound_prim(self, prim: Any) -> Any:
         from pxr import UsdShade
@@ -115,40 +144,29 @@ class MaterialReader:
         return Material(name=name)
 
     def _read(self, material: Any) -> Material:
-        from pxr import UsdShade
-
         name = str(material.GetPrim().GetName())
         shader = material.ComputeSurfaceSource()[0]
         if not shader or str(shader.GetIdAttr().Get()) != "UsdPreviewSurface":
             self.note(f"material '{name}' has no UsdPreviewSurface: default material used")
             return Material(name=name)
 
-        def of(key: str, default: Any) -> tuple[Any, Any, str]:
-            """(constant, texture shader or None, its output) of an input."""
-            source = shader.GetInput(key)
-            if source and source.HasConnectedSource():
-                attributes = UsdShade.Utils.GetValueProducingAttributes(source)
-                if attributes and UsdShade.Utils.GetType(attributes[0].GetName()) == UsdShade.AttributeType.Output:
-                    node = UsdShade.Shader(attributes[0].GetPrim())
-                    output = UsdShade.Output(attributes[0]).GetBaseName()
-                    if str(node.GetIdAttr().Get()) == "UsdUVTexture":
-                        return _constant(source, node, output, default), node, output
-                    # a primvar reader: the mesh's vertex colours take its place
-                    return ((1.0, 1.0, 1.0) if key == "diffuseColor" else default), None, ""
-            value = _value(source)
-            return (default if value is None else value), None, ""
-
+        of = partial(_input, shader)
         color, color_map, _ = of("diffuseColor", (0.18, 0.18, 0.18))
         roughness, rough_map, rough_channel = of("roughness", 0.5)
         metalness, metal_map, metal_channel = of("metallic", 0.0)
         _, normal_map, _ = of("normal", None)
-        opacity, _, _ = of("opacity", 1.0)
-        if float(opacity) < 1:
-            self.note(f"material '{name}': transparency ignored, drawn opaque")
         glow, glow_map, _ = of("emissiveColor", (0.0, 0.0, 0.0))
         base, base_factor = self._scaled(color_map, "srgb", "rgb", _rgb(color))
         rough, rough_factor = self._scaled(rough_map, "linear", rough_channel, (float(roughness),) * 3)
-        metal, metal_factor = self._scaled(metal_map, "linear", metal_channel, (float(metalness),) * 3)
+        if int(of("useSpecularWorkflow", 0)[0]) == 1:
+            tint, metal_map, _ = of("specularColor", (0.0, 0.0, 0.0))
+            shine, shine_factor = self._scaled(metal_map, "srgb", "rgb", _rgb(tint))
+            self.note(f"material '{name}': its specular workflow converted to metallic-roughness")
+            given = Specular(base_factor, shine_factor, 1.0, base, shine)
+            base, base_factor, metal, metal_factor = _metallic(given)
+            color_map = metal_map = color_map or metal_map  # both are made of both of its textures
+        else:
+            metal, metal_factor = self._scaled(metal_map, "linear", metal_channel, (float(metalness),) * 3)
         # without the texture that says where it glows, nothing does
         emission, strength = self._scaled(glow_map, "srgb", "rgb", (0.0, 0.0, 0.0) if glow_map else _rgb(glow))
         normal, normal_scale = self._normals(normal_map)
@@ -161,18 +179,34 @@ class MaterialReader:
             base_color_texture=base,
             orm_texture=pack_orm(rough, metal) if rough or metal else None,
             normal_texture=normal,
-            opacity=float(opacity),
+            opacity=self._opacity(shader, name),
             emission=strength,
             emission_texture=emission,
         )
+        if rough and metal and not np.allclose(_frame(rough_map), _frame(metal_map)):
+            self.note(
+                f"material '{name}': roughness and metalness differ in transform: the first one's is used for both"
+            )
         nodes = {
             "base_color_texture": color_map,
-            "orm_texture": rough_map or metal_map,
+            "orm_texture": rough_map if rough else metal_map,
             "normal_texture": normal_map,
             "emission_texture": glow_map,
         }
         self.frames[id(out)] = {n: _frame(node) for n, node in nodes.items() if node}
         return out
+
+    def _opacity(self, shader: Any, name: str) -> float:
+        """The constant; what drives it beside is noted, for all is drawn opaque."""
+        opacity, node, _ = _input(shader, "opacity", 1.0)
+        threshold = float(_value(shader.GetInput("opacityThreshold")) or 0.0)
+        if node:
+            cut = f", cut out at {threshold:g}" if threshold > 0 else ""
+            self.note(f"material '{name}': transparency (by a texture{cut}) ignored, drawn opaque")
+            return 1.0
+        if float(opacity) < 1:
+            self.note(f"material '{name}': transparency ignored, drawn opaque")
+        return float(opacity)
 
     def in_one_frame(self, meshes: list[Mesh], keep_layout: bool = False) -> list[Mesh]:
         """Texture transforms applied, and textures brought under one transform and wrap mode where they differ; or all
@@ -246,6 +280,37 @@ class MaterialReader:
             else:
                 self._pixels[text] = images.read(self.companions.find(text, self.path))
         return self._pixels[text]
+
+
+def _input(shader: Any, key: str, default: Any) -> tuple[Any, Any, str]:
+    """(constant, texture shader or None, its output) of an input of a surface."""
+    from pxr import UsdShade
+
+    source = shader.GetInput(key)
+    if source and source.HasConnectedSource():
+        attributes = UsdShade.Utils.GetValueProducingAttributes(source)
+        if attributes and UsdShade.Utils.GetType(attributes[0].GetName()) == UsdShade.AttributeType.Output:
+            node = UsdShade.Shader(attributes[0].GetPrim())
+            output = UsdShade.Output(attributes[0]).GetBaseName()
+            if str(node.GetIdAttr().Get()) == "UsdUVTexture":
+                return _constant(source, node, output, default), node, output
+            # a primvar reader: the mesh's vertex colours take its place
+            return ((1.0, 1.0, 1.0) if key == "diffuseColor" else default), None, ""
+    value = _value(source)
+    return (default if value is None else value), None, ""
+
+
+def _metallic(
+    given: Specular,
+) -> tuple[Texture | None, tuple[float, float, float], Texture | None, tuple[float, float, float]]:
+    """(base colour, its factor, metalness, its factor) of the specular workflow, whose two colours mean what those of
+    glTF's specular-glossiness materials do."""
+    if given.diffuse_texture is None and given.specular_texture is None:
+        color, _, metalness = specular_glossiness.constants(given)
+        return None, color, None, (metalness,) * 3
+    base, orm = specular_glossiness.textures(given)
+    metal = Texture(np.ascontiguousarray(orm.pixels[..., 2:3]), "linear", orm.wrap)
+    return base, (1.0, 1.0, 1.0), metal, (1.0, 1.0, 1.0)
 
 
 def _vector(node: Any, key: str, default: float) -> Any:

@@ -30,6 +30,9 @@ _TO_Y_UP = {
     "X": np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]),
 }
 
+_UVS = "uvs:"
+"""Before the name of a primvar of texture coordinates, among the attributes of a mesh."""
+
 
 def load_usd(
     path: Path,
@@ -130,9 +133,28 @@ class _Reader:
             elif prim.IsA(UsdGeom.Gprim) and self._shown(prim):
                 geometry = self._geometry(prim)
                 if geometry is not None:
-                    meshes += self._split(prim, geometry, self.cache.GetLocalToWorldTransform(prim))
+                    meshes += self._split(prim, geometry, self._to_world(prim))
         meshes = self.materials.in_one_frame(meshes, keep_layout)
         return Asset(tuple(meshes), self.path.stem, tuple(self.companions.notes))
+
+    def _to_world(self, prim: Any) -> Any:
+        """From a mesh's own frame to the world. A skinned one is kept at its bind pose, where its own transform does
+        not count (UsdSkel, "Skinning a Point"): its geomBindTransform leads into the frame of its skeleton."""
+        from pxr import UsdSkel
+
+        world = self.cache.GetLocalToWorldTransform(prim)
+        binding = UsdSkel.BindingAPI(prim)
+        if binding.GetBlendShapesAttr().Get():
+            self.note(f"'{prim.GetPath()}': blend shapes ignored")
+        if not binding.GetJointIndicesPrimvar().HasValue():
+            return world
+        self.note(f"'{prim.GetPath()}': the bind pose is kept, skinning dropped")
+        skeleton = binding.GetInheritedSkeleton()
+        bound = binding.GetGeomBindTransformAttr().Get(self.time)
+        if not skeleton:
+            return world
+        to_world = self.cache.GetLocalToWorldTransform(skeleton.GetPrim())
+        return to_world if bound is None else bound * to_world
 
     def _shown(self, prim: Any) -> bool:
         from pxr import UsdGeom
@@ -169,7 +191,7 @@ class _Reader:
                 geometry = self._geometry(part) if part.IsA(UsdGeom.Gprim) and self._shown(part) else None
                 if geometry is None:
                     continue
-                local = self.cache.GetLocalToWorldTransform(part) * back
+                local = self._to_world(part) * back
                 for i in np.flatnonzero(number == k):
                     meshes += self._split(part, geometry, local * transforms[int(i)] * world)
         return meshes
@@ -216,7 +238,7 @@ class _Reader:
             for _ in range(self.refine):
                 face_ids = np.repeat(face_ids, values["points"][1].counts)
                 for name, (value, where) in values.items():
-                    value, where, left = catmull_clark(value, where, name == "uvs", sharpness.get(name))
+                    value, where, left = catmull_clark(value, where, name.startswith(_UVS), sharpness.get(name))
                     values[name] = value, where
                     if name in sharpness:
                         sharpness[name] = left
@@ -252,11 +274,12 @@ class _Reader:
 
         api = UsdGeom.PrimvarsAPI(prim)
         out: dict[str, tuple[NDArray, Polygons]] = {}
-        uv = api.GetPrimvar(self.materials.uv_name(prim))
-        if uv and uv.HasValue():
-            found = _expand(uv.ComputeFlattened(self.time), uv.GetInterpolation(), polygons, 2)
-            if found is not None:
-                out["uvs"] = (np.stack([found[0][:, 0], 1 - found[0][:, 1]], axis=1), found[1])
+        for name in self.materials.uv_names(prim):
+            uv = api.GetPrimvar(name)
+            if uv and uv.HasValue():
+                found = _expand(uv.ComputeFlattened(self.time), uv.GetInterpolation(), polygons, 2)
+                if found is not None:
+                    out[_UVS + name] = (np.stack([found[0][:, 0], 1 - found[0][:, 1]], axis=1), found[1])
         out |= self._colors(prim, polygons)
         normals = api.GetPrimvar("normals")
         value, how = None, ""
@@ -280,8 +303,6 @@ class _Reader:
 
     def _split(self, prim: Any, geometry: _Geometry, to_world: Any) -> list[Mesh]:
         """Triangles with one index for all attributes, one mesh per material."""
-        from pxr import UsdGeom
-
         values, face_ids = geometry.values, geometry.face_ids
         points, polygons = values["points"]
         corners, face = triangulate(polygons, points)
@@ -293,14 +314,14 @@ class _Reader:
         if np.linalg.det(linear) < 0:
             corners = corners[:, ::-1]
         cofactor = np.linalg.inv(linear).T if abs(np.linalg.det(linear)) > 0 else np.eye(3)
-        names = list(values)
         meshes = []
-        for material, chosen in self.materials.bindings(prim, UsdGeom.Mesh(prim), face_ids[face]):
+        for material, uv_name, chosen in self.materials.bindings(prim, face_ids[face]):
+            names = [n for n in values if not n.startswith(_UVS) or n == _UVS + uv_name]
             rows = np.stack([values[n][1].indices[corners[chosen]].ravel() for n in names], axis=1)
             if not len(rows):
                 continue
             used, index = np.unique(rows, axis=0, return_inverse=True)
-            got = {n: values[n][0][used[:, k]] for k, n in enumerate(names)}
+            got = {n.split(":")[0]: values[n][0][used[:, k]] for k, n in enumerate(names)}
             normals = got.get("normals")
             if normals is not None:
                 normals = normals @ cofactor

@@ -24,7 +24,8 @@ _SPACES: dict[str, ColorSpace] = {"sRGB": "srgb", "raw": "linear"}
 
 def save_usd(asset: Asset, path: Path) -> None:
     """Write .usd, .usda or .usdc with PNG files in ``<stem>_textures/``, or one .usdz package. Y up,
-    metres. Raises OSError when the disk refuses."""
+    metres. Vertex colours, times the base colour, are read by the surface where it has no texture of that; a
+    UsdPreviewSurface cannot multiply the two. Raises OSError when the disk refuses."""
     from pxr import Sdf, Tf, UsdUtils
 
     path = Path(path)
@@ -64,14 +65,20 @@ def _write_stage(asset: Asset, root: Path, textures: str) -> None:
     stage.SetDefaultPrim(top.GetPrim())
     Usd.ModelAPI(top.GetPrim()).SetKind(Kind.Tokens.component)
     UsdGeom.Scope.Define(stage, f"/{name}/Materials")
-    materials: dict[int, Any] = {}
+    materials: dict[tuple[int, bool], Any] = {}
     for k, mesh in enumerate(asset.meshes):
-        if id(mesh.material) not in materials:
+        key = (id(mesh.material), _colored(mesh))
+        if key not in materials:
             word = Tf.MakeValidIdentifier(mesh.material.name)[:MAX_NAME]
             target = f"/{name}/Materials/M{len(materials)}_{word}"
-            materials[id(mesh.material)] = _material(stage, target, mesh.material, root.parent / textures)
-        _mesh(stage, f"/{name}/G{k}_{Tf.MakeValidIdentifier(mesh.name)}", mesh, materials[id(mesh.material)])
+            materials[key] = _material(stage, target, mesh.material, root.parent / textures, _colored(mesh))
+        _mesh(stage, f"/{name}/G{k}_{Tf.MakeValidIdentifier(mesh.name)}", mesh, materials[key])
     stage.GetRootLayer().Save()
+
+
+def _colored(mesh: Mesh) -> bool:
+    """Do vertex colours drive the base colour?"""
+    return mesh.colors is not None and mesh.material.base_color_texture is None
 
 
 def _mesh(stage: Any, target: str, mesh: Mesh, material: Any) -> None:
@@ -95,17 +102,21 @@ def _mesh(stage: Any, target: str, mesh: Mesh, material: Any) -> None:
         st.Set(Vt.Vec2fArray.FromNumpy(np.ascontiguousarray(uvs, np.float32)))
     if mesh.colors is not None:
         color = api.CreatePrimvar("displayColor", Sdf.ValueTypeNames.Color3fArray, UsdGeom.Tokens.vertex)
-        color.Set(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(mesh.colors, np.float32)))
+        factor = mesh.material.base_color if _colored(mesh) else (1.0, 1.0, 1.0)
+        color.Set(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(mesh.colors * np.array(factor, np.float32), np.float32)))
     UsdShade.MaterialBindingAPI.Apply(out.GetPrim()).Bind(material)
 
 
-def _material(stage: Any, target: str, m: Material, folder: Path) -> Any:
+def _material(stage: Any, target: str, m: Material, folder: Path, colored: bool) -> Any:
     from pxr import UsdShade
 
     material = UsdShade.Material.Define(stage, target)
     preview = _Preview(stage, target, folder)
     material.CreateSurfaceOutput().ConnectToSource(preview.shader.ConnectableAPI(), "surface")
-    preview.color("diffuseColor", "base_color", m.base_color, m.base_color_texture)
+    if colored:
+        preview.vertex_color("diffuseColor")
+    else:
+        preview.color("diffuseColor", "base_color", m.base_color, m.base_color_texture)
     if m.emits:
         preview.color("emissiveColor", "emission", m.emission, m.emission_texture)
     preview.roughness_and_metalness(m)
@@ -181,6 +192,12 @@ class _Preview:
             return
         scale = None if tuple(factor) == (1.0, 1.0, 1.0) else (*factor, 1.0)
         self.connect(name, "Color3f", self.sampler(key, texture, "sRGB", scale), "rgb")
+
+    def vertex_color(self, name: str) -> None:
+        """A colour that is the mesh's displayColor."""
+        reader = self._node("displayColor", "UsdPrimvarReader_float3")
+        reader.CreateInput("varname", self.types.String).Set("displayColor")
+        self.connect(name, "Color3f", reader, "result")
 
     def roughness_and_metalness(self, m: Material) -> None:
         """Both, and occlusion, from one texture, or constants."""

@@ -41,10 +41,6 @@ class Validation:
     def __add__(self, other: Validation) -> Validation:
         return Validation(**{f.name: getattr(self, f.name) + getattr(other, f.name) for f in fields(self)})
 
-    def lines(self) -> list[str]:
-        """One line per count that is not zero."""
-        return [f"{f.name.replace('_', ' ')}: {getattr(self, f.name)}" for f in fields(self) if getattr(self, f.name)]
-
 
 def validate(asset: Asset) -> Validation:
     """Count what is wrong. Changes nothing."""
@@ -153,10 +149,15 @@ def repair_material(material: Material, source: str, notes: list[str]) -> Materi
     """The material with factors and float texels within [0, 1], and a note if they were not. Raises
     InputError for factors that are not numbers."""
     factors = (*material.base_color, material.roughness, material.metalness)
-    if not np.isfinite((*factors, material.normal_scale)).all():
+    others = (material.normal_scale, *material.emission, material.opacity, material.alpha_cutoff)
+    if not np.isfinite((*factors, *others)).all():
         raise InputError(
             f"{source}, material '{material.name}': a factor is NaN or infinite; set it to a number from 0 to 1"
         )
+    if min(material.emission) < 0:
+        notes.append(f"material '{material.name}': negative emission set to 0")
+        red, green, blue = (max(x, 0.0) for x in material.emission)
+        material = replace(material, emission=(red, green, blue))
     if min(factors) < 0 or max(factors) > 1:
         notes.append(f"material '{material.name}': factors outside of 0 to 1 clamped")
         r, g, b, roughness, metalness = (min(max(f, 0.0), 1.0) for f in factors)
