@@ -10,6 +10,7 @@ import pytest
 
 from appearance_opt.asset import images, load, save
 from appearance_opt.asset.encoding import encoded_for
+from appearance_opt.asset.packing import pack_orm
 from appearance_opt.asset.types import Asset, Material, Texture
 
 SCALES = {"uint8": 255, "uint16": 65535, "float32": 1}
@@ -52,6 +53,13 @@ def test_integers_in_the_slot_s_encoding_are_not_touched() -> None:
 def test_alpha_is_linear_in_every_slot() -> None:
     half = Texture(np.full((1, 1, 4), 0.5, np.float32), "linear")
     np.testing.assert_array_equal(encoded_for(half, "srgb")[0, 0], [188, 188, 188, 128])
+
+
+def test_roughness_that_a_file_calls_srgb_is_decoded() -> None:
+    """A sampler of USD may say so, wrong as it mostly is."""
+    dark = Texture(np.full((2, 2, 1), 128, np.uint8), "srgb")
+    np.testing.assert_allclose(pack_orm(dark, None).linear()[..., 1], dark.linear()[..., 0])
+    assert pack_orm(replace(dark, color_space="linear"), None).pixels.dtype == np.uint8
 
 
 STAGE = """#usda 1.0

@@ -10,6 +10,7 @@ import pytest
 
 from appearance_opt.asset import images, load, save
 from appearance_opt.asset.types import Asset, Material, Mesh, Texture, srgb_to_linear
+from appearance_opt.errors import InputError
 
 FACE = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\nusemtl m\nf 1/1 2/2 3/3\n"
 NORMALS = np.full((4, 4, 3), (128, 128, 255), np.uint8)
@@ -58,9 +59,19 @@ def test_values_of_options_may_be_left_out(tmp_path: Path, options: str) -> None
     np.testing.assert_allclose(np.ptp(asset.meshes[0].uvs, axis=0), 2)
 
 
+@pytest.mark.parametrize("name", ['"my  picture.png"', "my  picture.png", "-clamp on my  picture.png"])
+def test_names_with_spaces_and_quotation_marks(tmp_path: Path, name: str) -> None:
+    assert read(tmp_path, f"map_Kd {name}", **{"my  picture": NORMALS}).meshes[0].material.base_color_texture
+
+
+@pytest.mark.parametrize("statement", ["map_Kd -s", "map_Kd -s x t.png", "map_Kd -bm", "Tr x"])
+def test_options_without_their_values_are_refused(tmp_path: Path, statement: str) -> None:
+    with pytest.raises(InputError, match=r"x\.mtl: a value of material 'm' is missing or not a number"):
+        read(tmp_path, statement, t=NORMALS)
+
+
 def test_a_file_whose_name_is_a_number(tmp_path: Path) -> None:
-    images_ = images.encode_png(NORMALS)
-    (tmp_path / "7").write_bytes(images_)
+    (tmp_path / "7").write_bytes(images.encode_png(NORMALS))
     assert read(tmp_path, "map_Kd -s 2 2 7").meshes[0].material.base_color_texture is not None
 
 

@@ -30,11 +30,12 @@ def resized(pixels: NDArray[np.float32], height: int, width: int) -> NDArray[np.
 def pack_orm(roughness: Texture | None, metalness: Texture | None) -> Texture:
     """One (H, W, 3) texture from the first channels of two, either of which may be missing (1 then, so
     that the material's factor decides). The smaller is brought to the size of the larger; 8-bit maps
-    of one size stay 8 bit."""
+    of one size, linear ones, stay 8 bit."""
     given = [t for t in (roughness, metalness) if t is not None]
     height = max(t.pixels.shape[0] for t in given)
     width = max(t.pixels.shape[1] for t in given)
-    if all(t.pixels.dtype == np.uint8 and t.pixels.shape[:2] == (height, width) for t in given):
+    plain = [t.pixels.dtype == np.uint8 and t.color_space == "linear" for t in given]
+    if all(plain) and all(t.pixels.shape[:2] == (height, width) for t in given):
         out = np.full((height, width, 3), 255, np.uint8)
         planes = [None if t is None else t.pixels[..., 0] for t in (roughness, metalness)]
     else:
