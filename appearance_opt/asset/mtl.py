@@ -41,6 +41,10 @@ _USED = ("map_kd", "map_pr", "map_pm", "map_ke", "map_ka", *_NORMAL, *_BUMP)
 _NOT_MAPS = ("map_aat", "map_d")
 """The first is a switch; the second has a note of its own."""
 
+WITHOUT_MAP, LOST = "# without its map: ", "lost:"
+"""Start of the comments in which our own files keep a constant for when its map gets lost, and what stands for it here
+before the constant's key. The maps hold the factors there, and the constants beside them are 1 (see ``obj_write``)."""
+
 UNIT, MOSTLY = 0.1, 0.9
 """A picture is taken for a normal map if at least the share ``MOSTLY`` of its texels, decoded, have a length within
 ``UNIT`` of 1 and point outward."""
@@ -72,6 +76,8 @@ class MaterialReader:
         statements: dict[str, dict[str, str]] = {}
         current: dict[str, str] = {}
         for line in read_bytes(path).decode("utf-8", errors="replace").splitlines():
+            if line.startswith(WITHOUT_MAP):
+                line = LOST + line[len(WITHOUT_MAP) :]
             words = line.split(None, 1)
             if len(words) < 2 or words[0].startswith("#"):
                 continue
@@ -126,7 +132,7 @@ class _Statements:
         )
 
     def _numbers(self, key: str, default: list[float]) -> list[float]:
-        text = self.values.get(f"{key}_without_map", self.values.get(key))  # see ``obj_write``
+        text = self.values.get(LOST + key, self.values.get(key))
         return default if text is None else [float(w) for w in text.split()[:3]]
 
     def _normal(self) -> tuple[Texture | None, float]:

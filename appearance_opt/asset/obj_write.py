@@ -9,6 +9,7 @@ import numpy as np
 
 from appearance_opt.asset import images
 from appearance_opt.asset.encoding import encoded_for
+from appearance_opt.asset.mtl import WITHOUT_MAP
 from appearance_opt.asset.paths import file_name, replacing
 from appearance_opt.asset.types import Texture, linear_to_srgb
 
@@ -61,8 +62,8 @@ def _mtl_lines(m: Material, path: Path) -> list[str]:
     """The statements of a material, whose textures are written beside ``path``.
 
     Readers differ in whether Kd, Pr and Pm multiply their maps (the Wavefront convention) or stand back for them
-    (Blender): the maps hold the factors, and the constants are 1. ``..._without_map``, a statement of our own that
-    others pass over, is the factor alone, for when the map gets lost.
+    (Blender): the maps hold the factors, and the constants are 1. A comment keeps the factor alone, for when the map
+    gets lost.
     """
 
     def picture(suffix: str, pixels: NDArray) -> str:
@@ -82,7 +83,7 @@ def _mtl_lines(m: Material, path: Path) -> list[str]:
         text = " ".join(f"{x:.6g}" for x in values)
         if not mapped or all(x == 1 for x in values):
             return [f"{key} {text}"]
-        return [f"{key} {' '.join('1' for _ in values)}", f"{key}_without_map {text}"]
+        return [f"{key} {' '.join('1' for _ in values)}", f"{WITHOUT_MAP}{key} {text}"]
 
     orm = m.orm_texture is not None
     lines = [f"newmtl {m.name}", *constant("Kd", m.base_color, m.base_color_texture is not None)]
