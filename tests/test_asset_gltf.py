@@ -97,12 +97,24 @@ def test_node_transforms_and_mirroring(tmp_path: Path) -> None:
     document, binary = triangle_document(
         nodes=[{"children": [1], "scale": [-2, 1, 1]}, {"mesh": 0, "translation": [1, 0, 0]}]
     )
+    normals, tangents = np.float32([0, 0, 1]), np.float32([1, 0, 0, 1])
+    for k, (name, row) in enumerate((("NORMAL", normals), ("TANGENT", tangents)), 1):
+        data = np.tile(row, (3, 1)).tobytes()
+        document["meshes"][0]["primitives"][0]["attributes"][name] = k
+        accessor = {"bufferView": k, "componentType": 5126, "count": 3, "type": f"VEC{len(row)}"}
+        document["accessors"].append(accessor)
+        document["bufferViews"].append({"buffer": 0, "byteOffset": len(binary), "byteLength": len(data)})
+        binary += data
+    document["buffers"][0]["byteLength"] = len(binary)
     write_glb(tmp_path / "x.glb", document, binary)
     mesh = load(tmp_path / "x.glb").meshes[0]
     p = mesh.positions[mesh.faces[0]]
     assert {tuple(v) for v in p.tolist()} == {(-2, 0, 0), (-4, 0, 0), (-2, 1, 0)}
     # a mirrored node keeps its outside outside
     assert np.cross(p[1] - p[0], p[2] - p[0])[2] > 0
+    np.testing.assert_array_equal(mesh.normals, np.tile([0, 0, 1], (3, 1)))
+    # the bitangent is that of the file, (0, 1, 0), which the node leaves as it is: cross(normal, tangent) is not
+    np.testing.assert_array_equal(mesh.tangents, np.tile([-1, 0, 0, -1], (3, 1)))
 
 
 def test_strips_become_triangles_of_one_winding(tmp_path: Path) -> None:
