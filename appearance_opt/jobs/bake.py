@@ -76,7 +76,7 @@ def bake(
     watch = Stopwatch(began)
     for source in (high, low):
         check_paths(source, out, report)
-    heavy, light = loaded(high, options, variants), _low(low, options)
+    heavy, light = loaded(high, options, variants), loaded_low(low, options)
     watch.lap("load")
     run = BakeJob(heavy, light, str(low) if isinstance(low, (str, Path)) else light.name, options, watch)
     result, error = run.run(progress, report is not None)
@@ -97,8 +97,8 @@ def bake(
     return result
 
 
-def _low(source: str | Path | Asset, options: BakeOptions) -> Asset:
-    """LOW, with the vertices and texture coordinates of its file."""
+def loaded_low(source: str | Path | Asset, options: BakeOptions) -> Asset:
+    """LOW itself, or the file of that name with its vertices and texture coordinates as they are."""
     if not isinstance(source, (str, Path)):
         return source
     given = {"missing_textures": options.missing_textures, "root": options.root}
