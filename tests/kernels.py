@@ -45,8 +45,8 @@ def settles(run: _Run) -> bool:
 
 def looks_settle(run: _Run, steps: int) -> bool:
     """The same of a fit with a look in every ``steps`` steps: after ``FIRST`` looks, at most ``CHANCE`` of ``LATER``
-    bring new kernels. Measured: up to seven kernels after 16 steps, three after 64. What changes at every look, or at every fourth,
-    brings more."""
+    bring new kernels. Measured: up to seven kernels after 16 steps, three after 64. What changes at every look, or at
+    every fourth, brings more."""
     kernels = Kernels(run)
     new = [kernels.new(steps) > 0 for _ in range(FIRST + LATER)]
     return sum(new[FIRST:]) <= CHANCE
