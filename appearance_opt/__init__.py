@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from appearance_opt.errors import AppearanceError, BackendError, DivergedError, InputError, ReferenceRenderError
     from appearance_opt.jobs.bake import bake
     from appearance_opt.jobs.compare import compare
+    from appearance_opt.jobs.joint import joint
     from appearance_opt.jobs.simplify import simplify
 
 __version__ = "0.1.0"
@@ -25,6 +26,7 @@ _HOMES = {
     "bake": "appearance_opt.jobs.bake",
     "bake_options": "appearance_opt.config",
     "compare": "appearance_opt.jobs.compare",
+    "joint": "appearance_opt.jobs.joint",
     "load": "appearance_opt.asset",
     "save": "appearance_opt.asset",
     "simplify": "appearance_opt.jobs.simplify",
@@ -42,6 +44,7 @@ __all__ = [
     "bake",
     "bake_options",
     "compare",
+    "joint",
     "load",
     "save",
     "simplify",

@@ -13,7 +13,7 @@ from typing import Annotated, Any
 import typer
 
 from appearance_opt import __version__
-from appearance_opt.errors import AppearanceError
+from appearance_opt.errors import AppearanceError, InputError
 
 BEGAN = time.perf_counter()
 """Time budgets count from here: importing is part of a run."""
@@ -35,6 +35,8 @@ app = typer.Typer(
 def main() -> None:
     """Entry point: every expected failure is one line and exit code 2."""
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s: %(message)s")
+    # schedulers of clusters end a job so: like Ctrl-C, it keeps the best state
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         code = app(standalone_mode=False)
         if code == INTERRUPTED:  # how typer hands on a Ctrl-C
@@ -253,6 +255,8 @@ def bake(
 
     folder = None if no_report else report or out.with_name(out.stem + ".report")
     if options.joint:
+        if textures is not None:
+            raise InputError(f"--textures {textures}: a joint bake writes no loose maps; leave it out")
         from appearance_opt.jobs.joint import joint as run_joint
 
         with TerminalProgress() as progress:
@@ -295,8 +299,10 @@ def compare(
     resolution: Annotated[int, typer.Option(help="Pixels per side.", min=16)] = 384,
     seed: Annotated[int, typer.Option(help="Seed of views and lights.")] = 0,
     device: Annotated[str, typer.Option(help="auto, cpu or cuda.")] = "auto",
+    refine: Annotated[int, typer.Option(help="Level to which USD subdivision surfaces are refined.")] = 1,
     missing_textures: MissingTexturesOption = "error",
     root: RootOption = None,
+    variant: Annotated[list[str] | None, typer.Option(help="USD variant of REFERENCE: set=name (repeatable).")] = None,
 ) -> None:
     """Measure how different two assets look: PSNR, FLIP, silhouettes."""
     from appearance_opt.jobs.compare import compare as run
@@ -309,8 +315,10 @@ def compare(
         seed=seed,
         device=device,
         out=out,
+        refine=refine,
         missing_textures=missing_textures,  # type: ignore[arg-type]
         root=root,
+        variants=_variants(variant),
     )
     for note in result.notes:
         print(f"note: {note}", file=sys.stderr)
@@ -341,11 +349,13 @@ def inspect(
     from dataclasses import asdict
 
     from appearance_opt.asset import load
-    from appearance_opt.asset.validate import validate
+    from appearance_opt.asset.validate import repair, validate
 
     given = {"variants": _variants(variant), "missing_textures": missing_textures, "root": root}
-    asset = load(source, refine=refine, **given)  # type: ignore[arg-type]
-    found = {"meshes": len(asset.meshes), **asdict(validate(asset)), "notes": list(asset.notes)}
+    asset = load(source, refine=refine, mend=False, **given)  # type: ignore[arg-type]
+    found = {"meshes": len(asset.meshes), **asdict(validate(asset))}  # faults are counted as they are in the file
+    asset = repair(asset, str(source))
+    found["notes"] = list(asset.notes)
     if as_json:
         import json
 

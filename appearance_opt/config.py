@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import math
 import re
 import sys
 from collections.abc import Mapping
@@ -14,7 +15,7 @@ from appearance_opt.asset.companions import CHOICES as MISSING_TEXTURES
 from appearance_opt.asset.companions import MissingTextures
 from appearance_opt.errors import InputError
 
-FIT_PARTS = ("shape", "normal", "material", "gamma")
+FIT_PARTS = ("shape", "normal", "material")
 INITS = ("decimate", "sphere")
 LOSS_NAMES = ("log-srgb-l1", "log-srgb-l2", "l1", "l2", "smape", "relative-l2")
 BACKGROUNDS = ("random", "black", "white", "grey")
@@ -45,7 +46,7 @@ class CommonOptions:
     a new one takes its place (0: they stay). ``fit``: what moves. ``*_rate``: learning rates, positions in units of
     the local edge length; by default they follow from how good the start is. ``refine``: level for USD subdivision
     surfaces. ``missing_textures``: "error" or "ignore", when an input names a texture that is not there.
-    ``root``: folder in which files that inputs refer to may lie, beside their own.
+    ``root``: folder in which files that inputs refer to may lie, beside their own. ``seed``: of everything random.
     ``subdivision``: tessellation levels of a displaced result (none given: 3); ``write_tessellated``: write those
     meshes, too. Raises InputError for values that make no sense.
     """
@@ -83,6 +84,7 @@ class CommonOptions:
         _require(self.reuse >= 0, "reuse", self.reuse, "0 or more")
         _require(self.steps is None or self.steps >= 0, "steps", self.steps, "0 or more")
         _require(self.budget is None or self.budget > 0, "budget", self.budget, "a positive time such as 60s")
+        _require(self.seed >= 0, "seed", self.seed, "0 or more")
         _require(0 <= self.refine <= 5, "refine", self.refine, "from 0 to 5")
         for level in self.subdivision:
             _require(0 <= level <= MAX_SUBDIVISION, "subdivision", level, f"from 0 to {MAX_SUBDIVISION}")
@@ -91,8 +93,11 @@ class CommonOptions:
         for name in ("position_rate", "normal_rate", "color_rate", "material_rate", "displacement_rate"):
             rate = getattr(self, name)
             _require(rate is None or 0 <= rate <= 1, name.replace("_", "-"), rate, "from 0 to 1")
+        _require(bool(self.fit), "fit", "", f"some of {', '.join(FIT_PARTS)}")
         for part in self.fit:
             _choice("fit", part, FIT_PARTS)
+        given = self.displaced or self.displacement_rate is None
+        _require(given, "displacement-rate", self.displacement_rate, self._needs)
         _choice("loss", self.loss, LOSS_NAMES)
         _choice("light", self.light, LIGHTS)
         _choice("device", self.device, DEVICES)
@@ -118,9 +123,11 @@ class CommonOptions:
             return self.background
         try:
             r, g, b = (float(x) for x in self.background.split(","))
+            if not all(0 <= x < math.inf for x in (r, g, b)):
+                raise ValueError
         except ValueError:
             raise InputError(
-                f"--background {self.background}: give one of {', '.join(BACKGROUNDS)} or three numbers r,g,b"
+                f"--background {self.background}: give one of {', '.join(BACKGROUNDS)} or three numbers r,g,b from 0"
             ) from None
         return (r, g, b)
 
@@ -132,9 +139,9 @@ class SimplifyOptions(CommonOptions):
     ``triangles`` or ``ratio``: the budget (exactly one; neither is needed where
     ``init`` is a file). ``init``: "decimate", "sphere", or a file with a start.
     ``reallocate``: rounds in which triangles are moved to where the image error of the decimated mesh is.
-    ``relative``: the Laplacian keeps the start's shape (a sphere start uses the absolute one unless told
-    otherwise). ``keep_hidden``: keep geometry that no outside view sees. ``displacement``: fit a displacement map
-    on the tessellated mesh; ``normal_map``: make one at all. The others: ``CommonOptions``.
+    ``relative``: the Laplacian keeps the start's shape; None: where the start is a likeness of the input.
+    ``keep_hidden``: keep geometry that no outside view sees. ``displacement``: fit a displacement map on the
+    tessellated mesh; ``normal_map``: make one at all. The others: ``CommonOptions``.
     """
 
     triangles: int | None = None
@@ -204,7 +211,10 @@ class BakeOptions(CommonOptions):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        _require(not (self.joint and self.closed_form), "joint", "", "given without --closed-form")
+        if self.joint:
+            self._check_joint()
+        else:
+            _require(self.position_rate is None, "position-rate", self.position_rate, self._needs)
         _require(bool(self.maps), "maps", "", f"some of {', '.join(MAPS)}")
         for name in self.maps:
             _choice("maps", name, MAPS)
@@ -220,8 +230,18 @@ class BakeOptions(CommonOptions):
         _require(1 <= self.ao_rays <= 4096, "ao-rays", self.ao_rays, "from 1 to 4096")
         _require(self.ao_distance is None or self.ao_distance > 0, "ao-distance", self.ao_distance, "above 0")
 
+    def _check_joint(self) -> None:
+        """A joint bake makes a base mesh with normal map, material and displacement, nothing loose."""
+        _require(not self.closed_form, "joint", "", "given without --closed-form")
+        made = {"normal", "material", "displacement"}
+        asked = set(self.maps)
+        _require({"normal", "material"} <= asked <= made, "maps", ",".join(self.maps), "normal,material with --joint")
+        for name in ("hit", "green", "bits", "texture_format", "ao_rays", "ao_distance"):
+            plain = getattr(self, name) == getattr(BakeOptions, name)
+            _require(plain, name.replace("_", "-"), getattr(self, name), "given without --joint")
+
     def wants(self, name: str) -> bool:
-        """Is a map asked for? "material" is base-color and orm."""
+        """Is a map asked for? "material" is base-color, orm and emission."""
         return name in self.maps or ("material" in self.maps and name in ("base-color", "orm", "emission"))
 
 
@@ -275,9 +295,10 @@ def read_toml(path: Path, names: frozenset[str] = OPTION_NAMES) -> dict[str, Any
 
 def duration(text: str | float) -> float:
     """Seconds of "90", "60s", "5m", "1.5h". Raises InputError."""
-    if isinstance(text, (int, float)):
+    if isinstance(text, (int, float)) and not isinstance(text, bool):
         return float(text)
-    match = re.fullmatch(r"\s*(\d+(?:\.\d*)?|\.\d+)\s*(s|sec|m|min|h)?\s*", text)
+    pattern = r"\s*(\d+(?:\.\d*)?|\.\d+)\s*(s|sec|m|min|h)?\s*"
+    match = re.fullmatch(pattern, text) if isinstance(text, str) else None
     if match is None:
         raise InputError(f"'{text}' is not a time: write 90, 60s, 5m or 1.5h")
     return float(match[1]) * {"m": 60.0, "min": 60.0, "h": 3600.0}.get(match[2] or "s", 1.0)
@@ -298,6 +319,8 @@ def _converted(kind: type, name: str, value: Any) -> Any:
         return duration(value)
     if name in ("fit", "maps"):
         parts = value.split(",") if isinstance(value, str) else value
+        if not isinstance(parts, (list, tuple)) or not all(isinstance(p, str) for p in parts):
+            raise InputError(f"--{name} {value!r}: write names such as normal,material")
         return tuple(dict.fromkeys(p.strip() for p in parts if p.strip()))
     if name == "subdivision":
         return _levels(value)
@@ -306,6 +329,8 @@ def _converted(kind: type, name: str, value: Any) -> Any:
     allowed = tuple(k for word, types in kinds.items() if word in declared for k in types)
     if value is None and "None" in declared:
         return None
+    if isinstance(value, float) and not math.isfinite(value):
+        raise InputError(f"--{name.replace('_', '-')} {value}: is not a number")
     if allowed and (not isinstance(value, allowed) or (isinstance(value, bool) and bool not in allowed)):
         raise InputError(f"--{name.replace('_', '-')} {value!r}: expected {declared}")
     return value
@@ -327,7 +352,7 @@ def _require(ok: bool, name: str, value: Any, expected: str) -> None:
 
 def _choice(name: str, value: str, allowed: tuple[str, ...]) -> None:
     if value not in allowed:
-        close = difflib.get_close_matches(value, allowed, 1)
+        close = difflib.get_close_matches(str(value), allowed, 1)
         hint = f"; did you mean '{close[0]}'?" if close else ""
         raise InputError(f"--{name} {value}: choose from {', '.join(allowed)}{hint}")
 

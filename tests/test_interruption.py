@@ -17,7 +17,7 @@ import pytest
 from appearance_opt.asset import load, save
 from appearance_opt.asset.types import Asset
 from appearance_opt.errors import InputError
-from appearance_opt.jobs.simplify import check_paths
+from appearance_opt.jobs.paths import check_paths
 from appearance_opt.render.freezing import Frozen
 
 JOB = [

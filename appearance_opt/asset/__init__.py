@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 from appearance_opt.asset.companions import CHOICES, Companions, MissingTextures
@@ -22,6 +23,7 @@ def load(
     missing_textures: MissingTextures = "error",
     root: str | Path | None = None,
     keep_layout: bool = False,
+    mend: bool = True,
 ) -> Asset:
     """Read an asset; the suffix chooses the format. Units become metres, the up axis +Y.
 
@@ -31,7 +33,8 @@ def load(
     that) and a note. ``root``: folder in which files that it refers to may lie, beside its own. ``keep_layout``:
     for a mesh to be baked onto, whose vertices and texture coordinates stay as the file has them: no transform of a
     texture is applied to them, and a glTF mesh without normals is not taken apart into flat triangles. Harmless
-    faults are repaired and noted in ``Asset.notes``. Raises InputError for everything else, naming the file.
+    faults are repaired and noted in ``Asset.notes``, unless ``mend`` is off. Raises InputError for everything else,
+    naming the file.
     """
     path = Path(path)
     if missing_textures not in CHOICES:
@@ -51,7 +54,9 @@ def load(
         # numbers that do not fit a float32 become infinite, which ``repair`` refuses by name
         with np.errstate(over="ignore", invalid="ignore"):
             companions = Companions(missing_textures, None if root is None else Path(root))
-            return repair(_read(path, suffix, refine, variants, companions, keep_layout), str(path))
+            asset = _read(path, suffix, refine, variants, companions, keep_layout)
+            asset = replace(asset, files=(path.resolve(), *dict.fromkeys(companions.files)))
+            return repair(asset, str(path)) if mend else asset
     except MemoryError as error:
         raise InputError(f"{path}: asks for more memory than there is; it is damaged or too large") from error
 

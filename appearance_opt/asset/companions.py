@@ -24,11 +24,12 @@ T = TypeVar("T")
 class Companions:
     """``policy``: refuse an asset that lacks a file, or go on without it. ``root``: folder in which files may
     lie beside that of the file that names them. ``notes``: the reader's notes; each file that was ignored is named
-    there once."""
+    there once. ``files``: absolute paths of what was found."""
 
     policy: MissingTextures = "error"
     root: Path | None = None
     notes: list[str] = field(default_factory=list)
+    files: list[Path] = field(default_factory=list)
 
     def note(self, text: str) -> None:
         """Say something to the user, once."""
@@ -36,7 +37,13 @@ class Companions:
             self.notes.append(text)
 
     def find(self, reference: str, owner: Path, percent_encoded: bool = False) -> Path:
-        """Path of a file that ``owner`` refers to. Raises InputError as ``resolve`` does.
+        """Path of a file that ``owner`` refers to; see ``_find``."""
+        found = self._find(reference, owner, percent_encoded)
+        self.files.append(found.resolve())
+        return found
+
+    def _find(self, reference: str, owner: Path, percent_encoded: bool) -> Path:
+        """Raises InputError as ``resolve`` does.
 
         An absolute path names a place on the machine that wrote the file: where it leads nowhere, or to where nothing
         may be read, a file of the same name beside ``owner`` or in ``root`` stands for it, with a note.

@@ -15,6 +15,7 @@ Loaders convert what they read to these conventions; savers convert back.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -126,11 +127,12 @@ class Mesh:
 @dataclass(frozen=True)
 class Asset:
     """All meshes of one file, node transforms applied. ``notes`` lists, one line each, what the
-    loader dropped, repaired or assumed."""
+    loader dropped, repaired or assumed; ``files``, absolute paths of the files that it refers to."""
 
     meshes: tuple[Mesh, ...]
     name: str = "asset"
     notes: tuple[str, ...] = ()
+    files: tuple[Path, ...] = ()
 
     @property
     def triangle_count(self) -> int:

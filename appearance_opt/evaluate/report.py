@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import html
 import json
+import math
 import shutil
 import tempfile
 from dataclasses import asdict, dataclass, field
@@ -49,14 +50,16 @@ def write_report(folder: Path, data: ReportData) -> None:
             encoded[f"map_{_slug(name)}.png"] = encode_png(pixels)
         for name, content in encoded.items():
             (building / name).write_bytes(content)
-        (building / "report.json").write_text(json.dumps(as_json(data), indent=1))
+        (building / "report.json").write_text(json.dumps(as_json(data), indent=1, allow_nan=False))
         (building / "report.html").write_text(page(data, encoded), encoding="utf-8")
         folder.mkdir(exist_ok=True)
         for file in sorted(building.iterdir()):
             file.replace(folder / file.name)
-        folder.chmod(0o755)
     finally:
         shutil.rmtree(building, ignore_errors=True)
+
+
+_CURVE = ("seconds", "step", "psnr", "loss")
 
 
 def as_json(data: ReportData) -> dict[str, Any]:
@@ -65,7 +68,11 @@ def as_json(data: ReportData) -> dict[str, Any]:
         "title": data.title,
         "facts": data.facts,
         "metrics": {name: asdict(m) for name, m in data.metrics.items()},
-        "curve": [dict(zip(("seconds", "step", "psnr", "loss"), row, strict=True)) for row in data.curve],
+        # JSON has no NaN: there is no loss before the first step
+        "curve": [
+            {name: value if math.isfinite(value) else None for name, value in zip(_CURVE, row, strict=True)}
+            for row in data.curve
+        ],
         "notes": data.notes,
     }
 

@@ -26,7 +26,7 @@ def write(path: Path, fingerprint: str, arrays: Mapping[str, NDArray]) -> None:
     identifies input and options of the job."""
     with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".tmp", delete=False) as file:
         try:
-            np.savez(file, allow_pickle=False, fingerprint=np.array(fingerprint), **arrays)
+            np.savez(file, fingerprint=np.array(fingerprint), **arrays)  # type: ignore[arg-type]
             file.flush()
             os.replace(file.name, path)
         except BaseException:

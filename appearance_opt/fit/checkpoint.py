@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 
@@ -101,6 +102,10 @@ class Checkpointer:
 
 def _fill(model: Model, state: FitState, arrays: dict[str, np.ndarray]) -> None:
     best = {}
+    for name, parameter in model.parameters.items():
+        there, wanted = arrays[f"value/{name}"].size, dr.width(parameter.value)
+        if there != wanted:
+            raise ValueError(f"it holds {there} {name}, the start has {wanted}")
     for name, parameter in model.parameters.items():
         parameter.value = mi.Float(arrays[f"value/{name}"])
         first, second, mean = (mi.Float(arrays[f"{kind}/{name}"]) for kind in ("first", "second", "mean"))

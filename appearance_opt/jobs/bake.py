@@ -71,12 +71,16 @@ def bake(
     Raises AppearanceError.
     """
     from appearance_opt.jobs.fitting import Stopwatch, conclude
-    from appearance_opt.jobs.simplify import check_paths, loaded
+    from appearance_opt.jobs.paths import check_paths, check_replaces
+    from appearance_opt.jobs.simplify import loaded
 
+    if options.joint:
+        raise InputError("joint bakes have a function of their own, appearance_opt.joint, with another result")
     watch = Stopwatch(began)
     for source in (high, low):
-        check_paths(source, out, report)
+        check_paths(source, out, report, textures)
     heavy, light = loaded(high, options, variants), loaded_low(low, options)
+    check_replaces((heavy, light), out, textures)
     watch.lap("load")
     run = BakeJob(heavy, light, str(low) if isinstance(low, (str, Path)) else light.name, options, watch)
     result, error = run.run(progress, report is not None)
@@ -148,7 +152,7 @@ class BakeJob:
         from appearance_opt.jobs.start import Start
 
         baked = bake_closed_form(self.reference, self.mesh, self._settings())
-        self._check_missed(baked)
+        self.check_missed(baked)
         self.watch.lap("closed form")
         closed = self._result(baked.maps)
         result = BakeResult(
@@ -214,7 +218,8 @@ class BakeJob:
         written = {"normal": o.wants("normal"), "material": both}
         return () if o.closed_form else tuple(p for p in o.fit if written[p])
 
-    def _check_missed(self, baked: BakedMaps) -> None:
+    def check_missed(self, baked: BakedMaps) -> None:
+        """Raise InputError if most rays found nothing; a note if some did."""
         reach = f"{baked.reach * self.frame[1]:.4g} m"
         share = baked.missed_share
         if share > MISSED_ERROR:

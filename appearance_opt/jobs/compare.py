@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from appearance_opt import backend
+from appearance_opt.config import DEVICES
+from appearance_opt.errors import InputError
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -40,18 +42,26 @@ def compare(
     seed: int = 0,
     device: str = "auto",
     out: str | Path | None = None,
+    refine: int = 1,
     missing_textures: MissingTextures = "error",
     root: str | Path | None = None,
+    variants: dict[str, str] | None = None,
 ) -> Comparison:
     """Render both assets from ``views`` random cameras under random lights and measure the difference.
-    ``out``: folder for a report with pictures. ``missing_textures``, ``root``: see ``load``. Raises
-    AppearanceError."""
+    ``out``: folder for a report with pictures. ``refine``, ``missing_textures``, ``root``: see ``load``; ``variants``:
+    of the reference. Raises AppearanceError."""
     from appearance_opt.asset import load
     from appearance_opt.asset.types import Asset
 
+    if device not in DEVICES:
+        raise InputError(f"--device {device}: choose from {', '.join(DEVICES)}")
+    if seed < 0:
+        raise InputError(f"--seed {seed}: must be 0 or more")
     first, second = (
-        a if isinstance(a, Asset) else load(a, missing_textures=missing_textures, root=root)
-        for a in (reference, candidate)
+        a
+        if isinstance(a, Asset)
+        else load(a, refine=refine, missing_textures=missing_textures, root=root, variants=chosen)
+        for a, chosen in ((reference, variants), (candidate, None))
     )
     backend.select(device)
     from appearance_opt.jobs.simplify import in_frame, support

@@ -174,7 +174,10 @@ def kept(path: Path, fingerprint: str, make: Callable[[], tuple[Start, bool]]) -
     start, interrupted = make()
     arrays = {name: getattr(start.mesh, name) for name in _MESH}
     arrays.update({f"map/{name}": np.asarray(value) for name, value in start.maps.items()})
-    archive.write(path, fingerprint, {**arrays, "known": start.known, "grown": np.asarray(start.grown)})
+    if start.finest is not None:
+        arrays.update({f"finest/{name}": getattr(start.finest, name) for name in _MESH})
+    arrays.update({name: np.asarray(getattr(start, name)) for name in ("known", "grown", "relative", "levels")})
+    archive.write(path, fingerprint, arrays)
     return start, interrupted
 
 
@@ -184,4 +187,6 @@ _MESH = ("positions", "faces", "frame_vertex", "frame_faces", "uvs")
 def _start(arrays: dict[str, NDArray]) -> Start:
     maps = {k[4:]: v if v.ndim else float(v) for k, v in arrays.items() if k.startswith("map/")}
     mesh = LatentMesh(*(arrays[name] for name in _MESH))
-    return Start(mesh, maps, True, arrays["known"], grown=bool(arrays["grown"]))
+    finest = LatentMesh(*(arrays[f"finest/{name}"] for name in _MESH)) if "finest/faces" in arrays else None
+    levels = tuple(int(level) for level in arrays["levels"])
+    return Start(mesh, maps, bool(arrays["relative"]), arrays["known"], levels, finest, bool(arrays["grown"]))

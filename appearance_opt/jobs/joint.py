@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from appearance_opt.asset import save
-from appearance_opt.jobs.simplify import SimplifyResult, check_paths, loaded
+from appearance_opt.jobs.paths import check_paths, check_replaces
+from appearance_opt.jobs.simplify import SimplifyResult, loaded
 
 if TYPE_CHECKING:
     from appearance_opt.asset.types import Asset
@@ -34,14 +35,15 @@ def joint(
     """Fit base shape, displacement, normals and material of ``low`` to ``high`` and write the result to ``out``
     (None: do not write). LOW keeps its topology and its texture coordinates; each kind of detail goes where it
     is represented best. Raises AppearanceError."""
-    from appearance_opt.jobs.bake import BakeJob
+    from appearance_opt.jobs.bake import BakeJob, loaded_low
     from appearance_opt.jobs.displaced import require_memory, write_companion, write_levels
     from appearance_opt.jobs.fitting import Stopwatch, conclude
 
     watch = Stopwatch(began)
     for source in (high, low):
         check_paths(source, out, report)
-    heavy, light = loaded(high, options, variants), loaded(low, options)
+    heavy, light = loaded(high, options, variants), loaded_low(low, options)
+    check_replaces((heavy, light), out)
     require_memory(light.triangle_count, options)
     watch.lap("load")
     job = BakeJob(heavy, light, str(low) if isinstance(low, (str, Path)) else light.name, options, watch)
@@ -77,6 +79,7 @@ def _fitted(job, light: Asset, options: BakeOptions, progress: Progress | None, 
     mesh = movable(job.mesh)
     drawn, displacement = displaced(job.reference, mesh, options, job.cage)
     found = bake(job.reference, drawn, Settings(options.texture_size, samples=options.samples))
+    job.check_missed(found)
     maps = {n: v for n, v in found.maps.items() if options.wants("normal") or not n.startswith("normal")}
     start = Start(mesh, {**maps, **displacement}, True, found.covered, options.levels())
     job.watch.lap("closed form")

@@ -5,16 +5,18 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from appearance_opt import backend
-from appearance_opt.asset import check_folder, check_writable, load, save
+from appearance_opt import __version__, backend
+from appearance_opt.asset import load, save
+from appearance_opt.asset.types import Texture
 from appearance_opt.config import CommonOptions, SimplifyOptions, as_dict, with_values
 from appearance_opt.errors import DivergedError, InputError
+from appearance_opt.jobs.paths import check_paths, check_replaces
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -80,7 +82,10 @@ def simplify(
 
     watch = Stopwatch(began)
     check_paths(source, out, report, checkpoint)
+    if Path(options.init).suffix:
+        check_paths(options.init, out)
     asset = loaded(source, options, variants)
+    check_replaces([asset], out)
     watch.lap("load")
     backend.select(options.device)
     run = _Job(asset, options, watch, progress, _checkpointer(asset, options, checkpoint, resume), report is not None)
@@ -115,23 +120,6 @@ def loaded(source: str | Path | Asset, options: CommonOptions, variants: dict[st
         return source
     given = {"missing_textures": options.missing_textures, "root": options.root}
     return load(source, refine=options.refine, variants=variants, **given)  # type: ignore[arg-type]
-
-
-def check_paths(
-    source: str | Path | Asset | None,
-    out: str | Path | None,
-    report: str | Path | None = None,
-    checkpoint: str | Path | None = None,
-) -> None:
-    """Raise InputError before any work if results could not be written, or would replace the input."""
-    if out is not None:
-        check_writable(Path(out))
-        check_folder(Path(out).parent)
-        if isinstance(source, (str, Path)) and Path(out).resolve() == Path(source).resolve():
-            raise InputError(f"{out}: is the input itself, which is never changed; choose another name")
-    for folder in (report, checkpoint):
-        if folder is not None:
-            check_folder(Path(folder))
 
 
 class _Job:
@@ -169,7 +157,7 @@ class _Job:
         elif options.init in ("decimate", "sphere"):
             triangles = budget(options, asset.triangle_count)
             left = seconds_left(options, watch, with_report)
-            self.start = make_start(self.reference, options, self.sampler, triangles, left)
+            self.start = self._kept(lambda: make_start(self.reference, options, self.sampler, triangles, left))
         else:
             mesh = loaded_mesh(Path(options.init), self.frame, asset.triangle_count, options)
             if options.relative is False and "shape" in options.fit and not options.displaced:
@@ -177,9 +165,18 @@ class _Job:
                 # the shape has been let go of; the mended one is a likeness
                 self.options = with_values(self.options, relative=None)
             else:
-                self.start = transferred(self.reference, mesh, options)
+                self.start = self._kept(lambda: transferred(self.reference, mesh, options))
         self.asset = asset
         watch.lap("start")
+
+    def _kept(self, make: Callable[[], Start]) -> Start:
+        """A start that a resumed run takes from beside its checkpoint: made again, it could be another one, as the time
+        that is left decides how often triangles are moved."""
+        from appearance_opt.jobs.growth import kept
+
+        if self.checkpointer is None:
+            return make()
+        return kept(self.checkpointer.start_path, self.checkpointer.fingerprint, lambda: (make(), False))[0]
 
     def _shaped(self, make_within: Callable[[Effort], tuple[Start, bool]]) -> Start:
         """A start whose shape is fitted first, in a part of the time or the steps."""
@@ -281,13 +278,28 @@ def _checkpointer(
         return None
     from appearance_opt.fit.checkpoint import Checkpointer
 
-    digest = hashlib.sha256(json.dumps(as_dict(options), sort_keys=True).encode())
+    return Checkpointer(Path(folder), _fingerprint(asset, options), resume, CHECKPOINT_SECONDS)
+
+
+def _fingerprint(asset: Asset, options: SimplifyOptions) -> str:
+    """Hash of all that a result depends on: options, version, every array of every mesh, every field of every
+    material."""
+    digest = hashlib.sha256(json.dumps([__version__, as_dict(options)], sort_keys=True).encode())
+
+    def add(value: object) -> None:
+        if isinstance(value, np.ndarray):
+            digest.update(repr((value.shape, str(value.dtype))).encode())
+            digest.update(np.ascontiguousarray(value).tobytes())
+        elif isinstance(value, Texture):
+            for f in fields(value):
+                add(getattr(value, f.name))
+        else:
+            digest.update(repr(value).encode())
+
     for mesh in asset.meshes:
-        digest.update(mesh.positions.tobytes())
-        digest.update(mesh.faces.tobytes())
-        digest.update(b"" if mesh.uvs is None else mesh.uvs.tobytes())
+        for name in ("positions", "faces", "normals", "uvs", "tangents", "colors"):
+            add(getattr(mesh, name))
     for material in {id(m.material): m.material for m in asset.meshes}.values():
-        digest.update(repr((material.base_color, material.roughness, material.metalness)).encode())
-        for texture in (material.base_color_texture, material.orm_texture, material.normal_texture):
-            digest.update(b"" if texture is None else texture.pixels.tobytes())
-    return Checkpointer(Path(folder), digest.hexdigest(), resume, CHECKPOINT_SECONDS)
+        for f in fields(material):
+            add(getattr(material, f.name))
+    return digest.hexdigest()

@@ -201,7 +201,7 @@ def loaded_mesh(
     from appearance_opt.asset.normals import weld
 
     # its own maps are not used: it may lack them
-    asset = load(path, refine=options.refine, missing_textures="ignore", keep_layout=True)
+    asset = load(path, refine=options.refine, missing_textures="ignore", root=options.root, keep_layout=True)
     most = None if options.triangles is None and options.ratio is None else budget(options, available)
     if most is not None and asset.triangle_count > most:
         raise InputError(f"--init {path}: has {asset.triangle_count} triangles, more than the {most} asked for")

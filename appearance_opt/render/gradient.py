@@ -124,7 +124,7 @@ def render(
     few samples that no silhouette crosses are not shaded but left to ``direct``. ``run``: how its stages are called
     (see ``freezing``)."""
     with dr.suspend_grad():
-        edges, met, filtered = None, None, 1.0
+        edges, met, filtered = None, None, quality.sample_width
         if quality.visibility == "pairs" and edge_list is not None:
             found = pairs.paired_samples(scene, edge_list, surface.vertices, records, grid, quality, defer, run)
             averaged, deferred, crossed = found.averaged, found.deferred, found.crossed

@@ -46,6 +46,7 @@ SETTINGS = {
     "edges 4, 8 rays": Quality(4.0, 8, 1),
     "edges 4, 8 rays, meetings": Quality(4.0, 8, 1, meetings=True),
     "edges 8, 16 rays, 2": Quality(8.0, 16, 2),
+    "edges 8, 16 rays, 2, meetings": Quality(8.0, 16, 2, meetings=True),
     "edges 8, 16 rays, 2 x 2": Quality(8.0, 16, 4),
     "edges 8, 16 rays, 2 x 2, meetings": Quality(8.0, 16, 4, meetings=True),
     "edges 16, 64 rays, 4 x 4": Quality(16.0, 64, 16),

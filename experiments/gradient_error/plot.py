@@ -8,6 +8,8 @@ from pathlib import Path
 
 import matplotlib
 
+from experiments.gradient_error.summary import summary
+
 IMAGES = Path("docs/images")
 
 
@@ -21,6 +23,7 @@ def draw(folder: Path) -> None:
         with path.open() as file:
             rows = list(csv.DictReader(file))
         path.with_suffix(".md").write_text(table(rows))
+        path.with_name(f"{name}_summary.md").write_text(summary(rows))
         error_against_time(rows, IMAGES / f"gradient_error_{name}.png")
         shutil.copyfile(path, IMAGES / f"gradient_error_{name}.csv")
 
