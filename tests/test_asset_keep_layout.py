@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import grid_sphere, make_asset
 
 import appearance_opt
 from appearance_opt.asset import images, load, save
 from appearance_opt.asset.types import Asset
+from tests.conftest import grid_sphere, make_asset
 from tests.test_asset_gltf import write_glb
 from tests.test_asset_gltf_nodes import document
 

@@ -11,14 +11,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from conftest import make_asset
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from test_asset_gltf import triangle_document, write_glb
 
 from appearance_opt.asset import images, load, save
 from appearance_opt.asset.types import Asset, Material, Texture
 from appearance_opt.errors import InputError
+from tests.conftest import make_asset
+from tests.test_asset_gltf import triangle_document, write_glb
 
 ROOTS = ("x.glb", "x.gltf", "x.bin", "x_0.png", "x.obj", "x.mtl", "x.usda", "x.usdc", "x.usdz", "x.ply", "x.stl")
 OWNERS = {"x.bin": "x.gltf", "x_0.png": "x.gltf", "x.mtl": "x.obj"}

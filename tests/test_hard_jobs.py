@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_hard_cases import SAMPLER, TRIANGLE, model_of
 
 from appearance_opt.asset import load
 from appearance_opt.asset.types import Asset, Mesh
@@ -25,6 +24,7 @@ from appearance_opt.latent.latent import LatentMesh
 from appearance_opt.reference.mesh import MeshReference
 from appearance_opt.reference.pool import ReferencePool
 from appearance_opt.views import Views
+from tests.test_hard_cases import SAMPLER, TRIANGLE, model_of
 
 REPEAT = 1e-5
 """How far two runs of a dozen steps may end apart, in units of the object's radius. Measured 3e-8; differences grow

@@ -36,11 +36,7 @@ class Laplacian:
         self._inverse_degree = mi.Float((1 / degree).astype(np.float32))
         self._scale = mi.Float((1 / edge_length).astype(np.float32))
         self._count = len(positions)
-        self._initial = mi.Vector3f(0)
-        if relative:
-            start = mi.Float(np.ascontiguousarray(positions, np.float32).ravel())
-            self._initial = self._delta(start)
-            dr.eval(self._initial)
+        self._start = mi.Float(np.ascontiguousarray(positions, np.float32).ravel()) if relative else None
 
     def __call__(self, positions: mi.Float) -> mi.Float:
         """The regularizer at flat positions (3 V); width 1, differentiable."""
@@ -48,12 +44,19 @@ class Laplacian:
 
     def per_vertex(self, positions: mi.Float) -> mi.Float:
         """Share of each vertex in the regularizer (V)."""
-        offset = (self._delta(positions) - self._initial) * self._scale
+        offset = self._delta(positions) * self._scale
         return dr.squared_norm(offset) / self._count
 
     def _delta(self, positions: mi.Float) -> mi.Vector3f:
+        """delta - delta', which is linear: of how far the vertices have moved. Where none around a vertex has, it is
+        exactly 0; as a difference of two sums it would be rounding, of which Adam makes whole steps."""
         total = dr.zeros(mi.Float, 3 * self._count)
-        dr.scatter_add(total, dr.gather(mi.Vector3f, positions, self._b), self._a)
-        dr.scatter_add(total, dr.gather(mi.Vector3f, positions, self._a), self._b)
-        own = dr.gather(mi.Vector3f, positions, dr.arange(mi.UInt32, self._count))
+        dr.scatter_add(total, self._moved(positions, self._b), self._a)
+        dr.scatter_add(total, self._moved(positions, self._a), self._b)
+        own = self._moved(positions, dr.arange(mi.UInt32, self._count))
         return own - dr.unravel(mi.Vector3f, total) * self._inverse_degree
+
+    def _moved(self, positions: mi.Float, index: mi.UInt32) -> mi.Vector3f:
+        """Vertices relative to their start, if there is one."""
+        now = dr.gather(mi.Vector3f, positions, index)
+        return now if self._start is None else now - dr.gather(mi.Vector3f, self._start, index)
