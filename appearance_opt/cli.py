@@ -349,12 +349,15 @@ def inspect(
     from dataclasses import asdict
 
     from appearance_opt.asset import load
-    from appearance_opt.asset.validate import repair, validate
+    from appearance_opt.asset.validate import MENDED, repair, validate
 
     given = {"variants": _variants(variant), "missing_textures": missing_textures, "root": root}
     asset = load(source, refine=refine, mend=False, **given)  # type: ignore[arg-type]
-    found = {"meshes": len(asset.meshes), **asdict(validate(asset))}  # faults are counted as they are in the file
+    raw = asdict(validate(asset))
     asset = repair(asset, str(source))
+    found = {"meshes": len(asset.meshes), **asdict(validate(asset))}
+    # what is mended is counted as it is in the file
+    found |= {name: raw[name] for name in MENDED}
     found["notes"] = list(asset.notes)
     if as_json:
         import json

@@ -42,6 +42,10 @@ class Validation:
         return Validation(**{f.name: getattr(self, f.name) + getattr(other, f.name) for f in fields(self)})
 
 
+MENDED = ("non_finite_positions", "indices_out_of_range", "degenerate_faces", "unreferenced_vertices")
+"""Counts that are zero after ``repair``, or that it refuses."""
+
+
 def validate(asset: Asset) -> Validation:
     """Count what is wrong. Changes nothing."""
     total = Validation()
