@@ -349,16 +349,12 @@ def inspect(
     from dataclasses import asdict
 
     from appearance_opt.asset import load
-    from appearance_opt.asset.validate import MENDED, repair, validate
+    from appearance_opt.asset.validate import inspected
 
     given = {"variants": _variants(variant), "missing_textures": missing_textures, "root": root}
     asset = load(source, refine=refine, mend=False, **given)  # type: ignore[arg-type]
-    raw = asdict(validate(asset))
-    asset = repair(asset, str(source))
-    found = {"meshes": len(asset.meshes), **asdict(validate(asset))}
-    # what is mended is counted as it is in the file
-    found |= {name: raw[name] for name in MENDED}
-    found["notes"] = list(asset.notes)
+    counts, asset = inspected(asset, str(source))
+    found = {"meshes": len(asset.meshes), **asdict(counts), "notes": list(asset.notes)}
     if as_json:
         import json
 

@@ -140,7 +140,7 @@ def test_vertex_colours_survive_a_round_trip(tmp_path: Path) -> None:
 
 def test_skinned_meshes_keep_their_bind_pose(tmp_path: Path) -> None:
     """The mesh's own transform does not count; geomBindTransform leads into the skeleton's frame."""
-    text = f"""def SkelRoot "root" {{
+    text = f"""def SkelRoot "figure" {{
     double3 xformOp:translate = (0, 0, 10)
     uniform token[] xformOpOrder = ["xformOp:translate"]
     def Skeleton "skeleton" {{
@@ -150,8 +150,8 @@ def test_skinned_meshes_keep_their_bind_pose(tmp_path: Path) -> None:
     }}
     def Mesh "m" (prepend apiSchemas = ["SkelBindingAPI"]) {{
         {TRIANGLE}
-        rel skel:skeleton = </root/skeleton>
-        rel skel:blendShapeTargets = </root/m/smile>
+        rel skel:skeleton = </figure/skeleton>
+        rel skel:blendShapeTargets = </figure/m/smile>
         uniform token[] skel:blendShapes = ["smile"]
         int[] primvars:skel:jointIndices = [0, 0, 0] (interpolation = "vertex"; elementSize = 1)
         float[] primvars:skel:jointWeights = [1, 1, 1] (interpolation = "vertex"; elementSize = 1)
@@ -163,5 +163,5 @@ def test_skinned_meshes_keep_their_bind_pose(tmp_path: Path) -> None:
 """
     asset = load(written(tmp_path, text))
     np.testing.assert_allclose(asset.meshes[0].positions.min(axis=0), [0, 5, 10])
-    assert "'/root/m': the bind pose is kept, skinning dropped" in asset.notes
-    assert "'/root/m': blend shapes ignored" in asset.notes
+    assert "'/figure/m': the bind pose is kept, skinning dropped" in asset.notes
+    assert "'/figure/m': blend shapes ignored" in asset.notes

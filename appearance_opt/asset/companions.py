@@ -51,9 +51,8 @@ class Companions:
         try:
             return resolve(reference, owner, percent_encoded, self.root)
         except InputError:
-            path = PureWindowsPath(
-                unquote(reference) if percent_encoded else reference
-            )  # it takes both kinds of slashes
+            # it takes both kinds of slashes
+            path = PureWindowsPath(unquote(reference) if percent_encoded else reference)
             if not path.root:
                 raise
         for folder in (owner.resolve().parent, *([] if self.root is None else [self.root.resolve()])):

@@ -42,8 +42,14 @@ class Validation:
         return Validation(**{f.name: getattr(self, f.name) + getattr(other, f.name) for f in fields(self)})
 
 
-MENDED = ("non_finite_positions", "indices_out_of_range", "degenerate_faces", "unreferenced_vertices")
-"""Counts that are zero after ``repair``, or that it refuses."""
+def inspected(asset: Asset, path: str) -> tuple[Validation, Asset]:
+    """(counts, the asset after ``repair``): of what that mends as it is in the file, of all else as it is left."""
+    found, mended = validate(asset), repair(asset, path)
+    counted = {name: getattr(found, name) for name in _MENDED}
+    return replace(validate(mended), **counted), mended
+
+
+_MENDED = ("non_finite_positions", "indices_out_of_range", "degenerate_faces", "unreferenced_vertices")
 
 
 def validate(asset: Asset) -> Validation:
