@@ -14,6 +14,7 @@ from appearance_opt.asset.types import Asset
 from appearance_opt.config import bake_options, simplify_options
 from appearance_opt.jobs.bake import bake
 from appearance_opt.jobs.compare import compare
+from appearance_opt.jobs.joint import joint
 from appearance_opt.jobs.simplify import simplify
 from scenes.analytic import bumpy_sphere
 
@@ -30,7 +31,8 @@ def simplified(asset: Asset, out: Path, **values: object) -> Asset:
 
 def baked(asset: Asset, out: Path, **values: object) -> None:
     low = simplified(asset, out, steps=0)
-    bake(asset, low, out / "y.glb", bake_options(**{**QUICK, **values}))
+    run = joint if values.get("joint") else bake
+    run(asset, low, out / "y.glb", bake_options(**{**QUICK, **values}))
 
 
 JOBS: dict[str, Callable[[Asset, Path], object]] = {
