@@ -396,8 +396,6 @@ def _print_result(out: Path, result: Any, folder: Path | None) -> None:
 
 
 def _variants(given: list[str] | None) -> dict[str, str] | None:
-    from appearance_opt.errors import InputError
-
     out = {}
     for text in given or []:
         name, separator, choice = text.partition("=")

@@ -97,17 +97,21 @@ def kill(job: tuple[Path, float], tmp_path: Path, moments: np.ndarray, suffix: s
     folder, seconds = job
     (tmp_path / "in.glb").write_bytes((folder / "in.glb").read_bytes())
     before = (tmp_path / "in.glb").read_bytes()
+    codes = []
     for share in moments:
         process = start(tmp_path, "--out", f"low{suffix}", "--checkpoint", "state")
         code, _ = stopped_at(process, share * seconds, signal.SIGKILL)
         assert code in (0, -signal.SIGKILL)
         check_whole(tmp_path)
         assert (tmp_path / "in.glb").read_bytes() == before
+        codes.append(code)
+    assert -signal.SIGKILL in codes
 
 
 def interrupt(job: tuple[Path, float], tmp_path: Path, moments: np.ndarray) -> None:
     folder, seconds = job
     (tmp_path / "in.glb").write_bytes((folder / "in.glb").read_bytes())
+    cut = 0
     for k, share in enumerate(moments):
         process = start(tmp_path, "--out", f"low{k}.glb")
         code, error = stopped_at(process, max(share * seconds, 0.5), signal.SIGINT)
@@ -118,6 +122,8 @@ def interrupt(job: tuple[Path, float], tmp_path: Path, moments: np.ndarray) -> N
         else:  # before the fit, or in the instant after the result was renamed
             assert "error: interrupted; what was written is complete" in error
         check_whole(tmp_path)
+        cut += "interrupted" in error  # in the line of an error, or in the note of a fit that ended early
+    assert cut
 
 
 def test_killed_runs_leave_no_broken_files(job: tuple[Path, float], tmp_path: Path) -> None:

@@ -93,6 +93,15 @@ class FitResult:
     interrupted: bool = False
     best_step: int = 0
 
+    def notes(self) -> list[str]:
+        """What the user should know about it, a line each."""
+        out = []
+        if self.skipped:
+            out.append(f"{self.skipped} steps with non-finite gradients were skipped")
+        if self.interrupted:
+            out.append(f"interrupted after {self.steps} steps: this is the best state so far")
+        return out
+
 
 class Progress(Protocol):
     """Called after every step and every look at the held-out views."""

@@ -176,10 +176,7 @@ class BakeJob:
         # gutters were filled before the fit, which moved those that lookups reach: filling again would undo that
         maps = {**baked.maps, **model.host_maps()}
         result.fit, result.asset, result.maps = fitted, self._result(maps), self._in_metres(maps)
-        if fitted.skipped:
-            self.notes.append(f"{fitted.skipped} steps with non-finite gradients were skipped")
-        if fitted.interrupted:
-            self.notes.append(f"interrupted after {fitted.steps} steps: this is the best state so far")
+        self.notes += fitted.notes()
         self.watch.lap("export")
         return result, error
 

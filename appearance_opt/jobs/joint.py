@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from appearance_opt.asset.types import Asset
     from appearance_opt.config import BakeOptions
     from appearance_opt.fit.loop import Progress
+    from appearance_opt.jobs.bake import BakeJob
 
 LAPLACIAN = 0.25
 """Weight of the Laplacian, as by default in a simplification."""
@@ -67,7 +68,9 @@ def joint(
     return result
 
 
-def _fitted(job, light: Asset, options: BakeOptions, progress: Progress | None, with_report: bool) -> SimplifyResult:
+def _fitted(
+    job: BakeJob, light: Asset, options: BakeOptions, progress: Progress | None, with_report: bool
+) -> SimplifyResult:
     from appearance_opt.baking.closed_form import Settings, bake
     from appearance_opt.baking.low import movable
     from appearance_opt.fit.model import Model, Rates
@@ -106,7 +109,7 @@ def _fitted(job, light: Asset, options: BakeOptions, progress: Progress | None, 
         fitted,
         len(mesh.faces),
         job.high.triangle_count,
-        notes=list(job.notes),
+        notes=[*job.notes, *fitted.notes()],
         error=error,
         tessellated=exporter.drawn(model, final),
     )

@@ -232,18 +232,13 @@ class _Job:
         result = exporter.base(model, maps)
         tessellated = exporter.drawn(model, maps) if o.displaced else {}
         self.watch.lap("export")
-        notes = list(self.asset.notes)
-        if fitted.skipped:
-            notes.append(f"{fitted.skipped} steps with non-finite gradients were skipped")
-        if fitted.interrupted:
-            notes.append(f"interrupted after {fitted.steps} steps: this is the best state so far")
         return SimplifyResult(
             result,
             begin,
             fitted,
             len(self.start.mesh.faces),
             self.asset.triangle_count,
-            notes=notes,
+            notes=[*self.asset.notes, *fitted.notes()],
             error=error,
             tessellated=tessellated,
         )
