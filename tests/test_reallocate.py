@@ -94,7 +94,7 @@ def test_triangles_move_to_where_something_is_seen(monkeypatch: pytest.MonkeyPat
 
 
 @pytest.mark.parametrize(
-    ("left", "taken", "rounds"), [(60.0, 5.0, 2), (60.0, 15.0, 1), (30.0, 15.0, 0), (-1.0, 5.0, 0), (None, 60.0, 2)]
+    ("left", "taken", "rounds"), [(60.0, 5.0, 2), (60.0, 8.0, 1), (60.0, 15.0, 0), (-1.0, 5.0, 0), (None, 60.0, 2)]
 )
 def test_slow_decimations_are_not_repeated(left: float | None, taken: float, rounds: int) -> None:
     assert affordable(2, taken, left) == rounds
