@@ -31,8 +31,8 @@ def test_links_lead_somewhere(tmp_path: Path) -> None:
 
 
 def names(text: str, option: str) -> bool:
-    """Does a text name this very option, and not only a longer one that begins like it?"""
-    return re.search(rf"--{option.replace('_', '-')}(?![\w-])", text) is not None
+    """Does a text name this very option as code, and not only a longer one that begins like it?"""
+    return re.search(rf"`--{option.replace('_', '-')}(?![\w-])", text) is not None
 
 
 def test_every_option_is_documented() -> None:

@@ -79,7 +79,7 @@ def test_triangles_move_to_where_something_is_seen(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr("appearance_opt.jobs.start.WORTHWHILE", 2.0)  # the moved ones are taken, whatever they gain
     asset = bumpy_sphere(20_000, 128)
     (mesh,) = asset.meshes
-    # bumps of the same heights all around, but the side of -x is black: whatever its shape, it looks the same
+    # bumps of the same heights all around, but the side of -x is black: whatever its shape, little of it is seen
     texel = (np.arange(128) + 0.5) / 128 * 2 - 1
     black = np.broadcast_to(texel < 0, (128, 128))
     assert mesh.material.base_color_texture is not None

@@ -121,7 +121,8 @@ def make_start(
 
 def affordable(rounds: int, taken: float, left: float | None) -> int:
     """Rounds of reallocation, of those asked for, that leave most of the time that is ``left`` to the fit when
-    one takes about as long as the first start has ``taken``. Both in seconds; None: no limit."""
+    one takes about as long as the first start has ``taken``, and all of them ``REALLOCATION_EXTRA`` times as long
+    besides. Both in seconds; None: no limit."""
     if left is None or taken <= 0:
         return rounds
     return min(rounds, max(int(REALLOCATION_SHARE * left / taken - REALLOCATION_EXTRA), 0))
