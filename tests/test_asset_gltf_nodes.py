@@ -238,7 +238,7 @@ def test_morph_targets_are_noted(tmp_path: Path) -> None:
     given, binary = triangle_document()
     given["meshes"][0]["primitives"][0]["targets"] = [{"POSITION": 0}]
     write_glb(tmp_path / "x.glb", given, binary)
-    assert "morph targets ignored" in load(tmp_path / "x.glb").notes
+    assert any("morph targets" in note for note in load(tmp_path / "x.glb").notes)
 
 
 def test_what_was_written_without_normals_is_read_flat(tmp_path: Path) -> None:

@@ -61,6 +61,10 @@ class Nodes:
         self.nodes = document.items("nodes")
         self._parents = {child: k for k, node in enumerate(self.nodes) for child in node.get("children", [])}
 
+    def roots(self) -> list[int]:
+        """The nodes that are no one's children."""
+        return [k for k in range(len(self.nodes)) if k not in self._parents]
+
     def world(self, index: int) -> NDArray[np.float64]:
         """(4, 4) transform of a node. Raises InputError if it is its own ancestor."""
         out, steps, at = np.eye(4), 0, index

@@ -18,6 +18,8 @@ from appearance_opt.asset.types import Asset, Mesh
 from appearance_opt.errors import InputError
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from numpy.typing import NDArray
 
     from appearance_opt.asset.companions import Companions
@@ -48,12 +50,8 @@ class _Reader:
 
     def asset(self) -> Asset:
         self._check_extensions()
-        json = self.document.json
-        roots = range(len(self.document.items("nodes")))
-        if self.document.items("scenes"):
-            roots = self.document.items("scenes")[json.get("scene", 0)].get("nodes", [])
         meshes: list[Mesh] = []
-        for root in roots:
+        for root in self._roots():
             self._visit(root, np.eye(4), meshes, set())
         for kind, what in (
             ("skins", "skins: the rest pose is kept, skinning dropped"),
@@ -63,6 +61,19 @@ class _Reader:
                 self.note(what)
         meshes = self.materials.in_one_frame(meshes, self.keep_layout)
         return Asset(tuple(meshes), self.path.stem, tuple(self.document.companions.notes))
+
+    def _roots(self) -> list[int]:
+        """The nodes at the top of what is drawn: those of the scene that the file names, else of the
+        first one; in a library without scenes, the nodes that are no one's children."""
+        scenes = self.document.items("scenes")
+        if not scenes:
+            return self.nodes.roots()
+        chosen = self.document.json.get("scene", 0)
+        names = [scene.get("name", f"scene{k}") for k, scene in enumerate(scenes)]
+        if len(scenes) > 1:
+            others = ", ".join(f"'{n}'" for k, n in enumerate(names) if k != chosen)
+            self.note(f"scene '{names[chosen]}' is taken, others ignored: {others}")
+        return scenes[chosen].get("nodes", [])
 
     def _check_extensions(self) -> None:
         for name in self.document.json.get("extensionsRequired", []):
@@ -87,25 +98,33 @@ class _Reader:
             mesh = self.document.items("meshes")[node["mesh"]]
             name = node.get("name") or mesh.get("name") or f"mesh{node['mesh']}"
             for k, primitive in enumerate(mesh["primitives"]):
-                meshes += self._primitive(primitive, node, world, name if k == 0 else f"{name}.{k}")
+                weights = node.get("weights", mesh.get("weights", ()))
+                meshes += self._primitive(primitive, node, world, name if k == 0 else f"{name}.{k}", weights)
         for child in node.get("children", []):
             self._visit(child, world, meshes, seen | {index})
 
-    def _primitive(self, primitive: dict[str, Any], node: dict[str, Any], world: NDArray, name: str) -> list[Mesh]:
-        """The meshes of a primitive, one for each place at which its node puts it."""
+    def _primitive(
+        self, primitive: dict[str, Any], node: dict[str, Any], world: NDArray, name: str, weights: Sequence[float]
+    ) -> list[Mesh]:
+        """The meshes of a primitive, one for each place at which its node puts it. ``weights``: of
+        its morph targets."""
         mode = primitive.get("mode", 4)
         if mode not in (4, 5, 6):
             self.note("points and lines ignored")
             return []
-        if primitive.get("targets"):
-            self.note("morph targets ignored")
         attributes = primitive["attributes"]
         compressed = Compressed.of(self.document, primitive)
+        # (weight, accessors) of the morph targets that count
+        targets = [(w, t) for w, t in zip(weights, primitive.get("targets", ()), strict=False) if w]
+        if primitive.get("targets"):
+            self.note("morph targets: the shape of their default weights is kept, others are dropped")
 
         def read(name: str) -> NDArray:
             if compressed is not None and name in compressed:
-                return compressed.attribute(name)
-            return self.document.accessor(attributes[name])
+                given = compressed.attribute(name)
+            else:
+                given = self.document.accessor(attributes[name])
+            return self._morphed(given, [(w, t[name]) for w, t in targets if name in t])
 
         positions = read("POSITION")[:, :3].astype(np.float64)
         if compressed is not None:
@@ -132,6 +151,21 @@ class _Reader:
             self.note("meshes without normals are shaded flat, as glTF 2.0 asks")
             meshes = [_flat(m) for m in meshes]
         return meshes
+
+    def _morphed(self, values: NDArray, displacements: list[tuple[float, int]]) -> NDArray:
+        """(V, width) values of an attribute plus the sum of weight * displacement, accessors of which
+        are given (glTF 2.0, 3.7.2.2); those of tangents have no handedness."""
+        if not displacements:
+            return values
+        out = values.astype(np.float64)
+        for weight, accessor in displacements:
+            moved = self.document.accessor(accessor)
+            if len(moved) != len(out):
+                raise InputError(
+                    f"{self.path}: a morph target moves {len(moved)} vertices of {len(out)}; export it again"
+                )
+            out[:, : moved.shape[1]] += float(weight) * moved
+        return out
 
 
 def _placed(mesh: Mesh, place: Placement) -> Mesh:

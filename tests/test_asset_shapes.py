@@ -1,0 +1,103 @@
+"""What of a file's shapes is drawn: default morph weights, scenes and their roots, holes, opacity."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from appearance_opt.asset import load
+from appearance_opt.asset.normals import unit
+from appearance_opt.errors import InputError
+from tests.test_asset_gltf import triangle_document, write_glb
+from tests.test_asset_gltf_nodes import ball, document
+
+
+def sparse(given: dict, binary: bytes, count: int, where: np.ndarray, values: np.ndarray) -> tuple[dict, bytes, int]:
+    """The document with one accessor more: zeros, but for ``values`` (N, 3) at the indices ``where`` (N,)."""
+    first = len(given["bufferViews"])
+    for data in (where.astype(np.uint32), values.astype(np.float32)):
+        given["bufferViews"].append({"buffer": 0, "byteOffset": len(binary), "byteLength": data.nbytes})
+        binary += data.tobytes()
+    given["buffers"][0]["byteLength"] = len(binary)
+    indices = {"bufferView": first, "componentType": 5125}
+    given["accessors"].append(
+        {
+            "componentType": 5126,
+            "count": count,
+            "type": "VEC3",
+            "sparse": {"count": len(where), "indices": indices, "values": {"bufferView": first + 1}},
+        }
+    )
+    return given, binary, len(given["accessors"]) - 1
+
+
+@pytest.mark.parametrize("where", ["mesh", "node"])
+def test_default_morph_weights_are_part_of_the_shape(tmp_path: Path, where: str) -> None:
+    positions, faces = ball(1)
+    count = len(positions)
+    tangents = np.tile(np.array([[1, 0, 0, -1]], np.float32), (count, 1))
+    rng = np.random.default_rng(0)
+    moved, turned, along = (rng.normal(size=(count, 3)).astype(np.float32) for _ in range(3))
+    attributes = {"POSITION": positions, "NORMAL": positions, "TANGENT": tangents}
+    given, binary = document(attributes, faces, (moved, turned, along))
+    few = np.array([1, 5, 7])
+    given, binary, second = sparse(given, binary, count, few, moved[few])
+    targets = [{"POSITION": 3, "NORMAL": 4, "TANGENT": 5}, {"POSITION": second}, {"POSITION": 4}]
+    given["meshes"][0]["primitives"][0]["targets"] = targets
+    given["meshes"][0]["weights"] = [0.5, 2.0, 0.0] if where == "mesh" else [9.0, 9.0, 9.0]
+    if where == "node":
+        given["nodes"][0]["weights"] = [0.5, 2.0, 0.0]
+    write_glb(tmp_path / "x.glb", given, binary)
+    asset = load(tmp_path / "x.glb")
+    want = positions + 0.5 * moved
+    want[few] += 2.0 * moved[few]
+    mesh = asset.meshes[0]
+    np.testing.assert_allclose(mesh.positions, want, atol=1e-6)
+    np.testing.assert_allclose(mesh.normals, unit(positions + 0.5 * turned), atol=1e-6)
+    np.testing.assert_allclose(mesh.tangents[:, :3], unit(tangents[:, :3] + 0.5 * along), atol=1e-6)
+    np.testing.assert_array_equal(mesh.tangents[:, 3], -1)
+    assert any("default weights" in note for note in asset.notes)
+
+
+def test_flat_normals_are_those_of_the_morphed_shape(tmp_path: Path) -> None:
+    given, binary = triangle_document()
+    given["meshes"][0] |= {"weights": [1.0]}
+    given["meshes"][0]["primitives"][0]["targets"] = [{"POSITION": 1}]
+    given, binary, _ = sparse(given, binary, 3, np.array([1]), np.array([[0.0, 0, 1]]))
+    write_glb(tmp_path / "x.glb", given, binary)
+    mesh = load(tmp_path / "x.glb").meshes[0]
+    np.testing.assert_allclose(mesh.normals, np.tile(unit(np.array([-1.0, 0, 1])), (3, 1)), atol=1e-6)
+
+
+def test_a_morph_target_of_another_length_is_refused(tmp_path: Path) -> None:
+    given, binary = triangle_document()
+    given["meshes"][0] |= {"weights": [1.0]}
+    given["meshes"][0]["primitives"][0]["targets"] = [{"POSITION": 1}]
+    given, binary, _ = sparse(given, binary, 2, np.array([1]), np.array([[0.0, 0, 1]]))
+    write_glb(tmp_path / "x.glb", given, binary)
+    with pytest.raises(InputError, match="moves 2 vertices of 3"):
+        load(tmp_path / "x.glb")
+
+
+def test_without_scenes_every_mesh_is_drawn_once(tmp_path: Path) -> None:
+    given, binary = triangle_document(nodes=[{"mesh": 0}, {"children": [0], "translation": [5, 0, 0]}, {"mesh": 0}])
+    del given["scenes"], given["scene"]
+    write_glb(tmp_path / "x.glb", given, binary)
+    meshes = load(tmp_path / "x.glb").meshes
+    assert sorted(float(m.positions[:, 0].min()) for m in meshes) == [0, 5]
+
+
+@pytest.mark.parametrize(("given", "taken", "place"), [({}, "left", 0), ({"scene": 1}, "right", 5)])
+def test_the_scene_that_is_taken_is_named(tmp_path: Path, given: dict, taken: str, place: int) -> None:
+    changed, binary = triangle_document(
+        nodes=[{"mesh": 0}, {"mesh": 0, "translation": [5, 0, 0]}],
+        scenes=[{"nodes": [0], "name": "left"}, {"nodes": [1], "name": "right"}],
+    )
+    del changed["scene"]
+    write_glb(tmp_path / "x.glb", {**changed, **given}, binary)
+    asset = load(tmp_path / "x.glb")
+    assert [float(m.positions[:, 0].min()) for m in asset.meshes] == [place]
+    other = {"left": "right", "right": "left"}[taken]
+    assert f"scene '{taken}' is taken, others ignored: '{other}'" in asset.notes
