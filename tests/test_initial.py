@@ -159,14 +159,14 @@ def test_transfer_onto_the_same_shape_looks_the_same(ball: Asset) -> None:
 
 
 def box_on_a_plinth() -> Asset:
-    """Two closed boxes that touch in the square |x|, |z| < 0.5 at y = 0, in smooth colours but for that square."""
+    """Two closed boxes that touch in the square |x|, |z| < 0.5 at y = 0: noise there, smooth colours elsewhere."""
     rng = np.random.default_rng(0)
     meshes = []
     for size, y in (((2.0, 1.0, 2.0), -0.5), ((1.0, 1.0, 1.0), 0.5)):
-        box = trimesh.creation.box(size).subdivide().subdivide()
+        box = trimesh.creation.box(size).subdivide().subdivide().subdivide()
         p = (box.vertices + (0, y, 0)).astype(np.float32)
         touching = (p[:, 1] == 0) & (np.abs(p[:, [0, 2]]).max(axis=1) < 0.5)
-        colors = np.where(touching[:, None], rng.random(p.shape), (p + 2) / 4).astype(np.float32)
+        colors = np.where(touching[:, None], rng.integers(0, 2, p.shape), (p + 2) / 4).astype(np.float32)
         meshes.append(Mesh(p, box.faces.astype(np.int32), colors=colors, material=Material(roughness=0.5)))
     return Asset(tuple(meshes))
 
@@ -187,12 +187,13 @@ def test_texels_that_nobody_sees_are_filled_smoothly() -> None:
     assert plain.hidden.sum() == filled.missed.sum() == 0
     seen = filled.covered & ~filled.hidden
     np.testing.assert_array_equal(after[seen], before[seen])
-    # what is filled varies slowly between neighbours, by 6 to 12 % of what noise does (0.28 to 0.31) with five ways
-    # of packing: a chart that nobody sees takes its colours from whatever lies beside it
+    # what is filled varies slowly between neighbours. A chart that nobody sees takes its colours from whatever lies
+    # beside it: with nine ways of packing, steps are 5 to 7 % of the noise in the mean, the largest one 5 to 15 %
     both = filled.hidden[:, 1:] & filled.hidden[:, :-1]
-    noise, left = (np.abs(np.diff(x, axis=1))[both].max() for x in (before, after))
-    assert noise > 0.2
-    assert 0 < left < 0.2 * noise
+    noise, left = (np.abs(np.diff(x, axis=1))[both] for x in (before, after))
+    assert noise.mean() > 0.03  # 0.1
+    assert 0 < left.mean() < 0.2 * noise.mean()
+    assert left.max() < 0.5 * noise.max()
 
 
 def test_fill_is_smooth_and_leaves_known_texels() -> None:

@@ -1,4 +1,8 @@
-"""Runs that are killed, interrupted or out of disk: whatever has its final name is whole."""
+"""Runs that are killed, interrupted or out of disk: whatever has its final name is whole.
+
+Signals come at events of a run (a file that is about to get its name, a module that is loaded, a line of progress),
+never at a time: how far a run is after some seconds depends on the machine and on what else it does.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +11,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import mitsuba as mi
@@ -19,41 +22,90 @@ from appearance_opt.asset.types import Asset
 from appearance_opt.errors import InputError
 from appearance_opt.jobs.paths import check_paths
 from appearance_opt.render.freezing import Frozen
+from tests.conftest import make_asset
 
 JOB = [
     "simplify", "in.glb", "--triangles", "150", "--texture-size", "32", "--resolution", "32",
-    "--pool", "8", "--views", "2", "--steps", "40", "--device", "cpu",
+    "--pool", "4", "--views", "2", "--reallocate", "0", "--device", "cpu",
 ]  # fmt: skip
 
 # the package beside these tests, whatever is installed
 ENVIRONMENT = {**os.environ, "PYTHONPATH": str(Path(__file__).resolve().parents[1])}
 
+HANGS = 1200
+"""Seconds after which a run counts as hanging, however busy the machine."""
 
-# what the installed command runs. `python -m` ends by the signal itself, whatever the exit code, when the interrupt
-# came while a C extension ran Python code
-COMMAND = "import sys; from appearance_opt.cli import main; sys.exit(main())"
+# what the installed command runs, with small reports. `python -m` ends by the signal itself, whatever the exit code,
+# when the interrupt came while a C extension ran Python code
+COMMAND = """
+import sys
+from appearance_opt.jobs import report
+report.VIEWS, report.RESOLUTION = 2, 64
+from appearance_opt.cli import main
+sys.exit(main())
+"""
+
+# sends itself a signal just before a file gets its final name, or just before a module is loaded
+AT_EVENT = """
+import os, sys
+from pathlib import Path
+event, name, number = sys.argv.pop(1), sys.argv.pop(1), int(sys.argv.pop(1))
+
+def watch(what, arguments):
+    global event
+    subject = arguments[1] if what == "os.rename" else arguments[0] if what == "import" else None
+    if what == event and isinstance(subject, (str, Path)) and Path(subject).name == name:
+        event = None
+        os.kill(os.getpid(), number)
+
+sys.addaudithook(watch)
+"""
+
+# counts the calls of this package's functions, and sends itself a signal at one of them. The last count goes to a file
+AT_CALL = """
+import atexit, os, sys
+from pathlib import Path
+number, wanted = int(sys.argv.pop(1)), int(sys.argv.pop(1))
+calls = 0
+
+def count(frame, what, argument):
+    global calls
+    if what == "call" and "appearance_opt" in frame.f_code.co_filename:
+        calls += 1
+        if calls == wanted:
+            os.kill(os.getpid(), number)
+
+atexit.register(lambda: Path("calls.txt").write_text(str(calls)))
+sys.setprofile(count)
+"""
 
 
-def start(folder: Path, *more: str) -> subprocess.Popen[str]:
-    command = [sys.executable, "-c", COMMAND, *JOB, *more]
+def start(folder: Path, code: str, *arguments: str) -> subprocess.Popen[str]:
     return subprocess.Popen(
-        command, cwd=folder, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, env=ENVIRONMENT
-    )
+        [sys.executable, "-c", code, *arguments],
+        cwd=folder, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, env=ENVIRONMENT,
+    )  # fmt: skip
 
 
-def processor_seconds(process: subprocess.Popen[str]) -> float:
-    """Seconds of computing so far: how far a run is, however busy the machine."""
-    fields = Path(f"/proc/{process.pid}/stat").read_text().rsplit(")", 1)[1].split()
-    return (int(fields[11]) + int(fields[12])) / 100
-
-
-def stopped_at(process: subprocess.Popen[str], seconds: float, how: signal.Signals) -> tuple[int, str]:
-    """(exit code, standard error) of a run that gets a signal after so many seconds of computing."""
-    while process.poll() is None and processor_seconds(process) < seconds:
-        time.sleep(0.01)
-    process.send_signal(how)
-    error = process.communicate(timeout=120)[1]
+def ended(process: subprocess.Popen[str]) -> tuple[int, str]:
+    """(exit code, standard error) of a run."""
+    try:
+        error = process.communicate(timeout=HANGS)[1]
+    finally:
+        process.kill()
     return process.returncode, error
+
+
+def run(folder: Path, *more: str) -> tuple[int, str]:
+    return ended(start(folder, COMMAND, *JOB, *more))
+
+
+def run_to_event(folder: Path, event: str, name: str, how: signal.Signals, *more: str) -> tuple[int, str]:
+    return ended(start(folder, AT_EVENT + COMMAND, event, name, str(int(how)), *JOB, *more))
+
+
+def run_to_call(folder: Path, number: int, how: signal.Signals, *more: str) -> tuple[int, str]:
+    return ended(start(folder, AT_CALL + COMMAND, str(int(how)), str(number), *JOB, *more))
 
 
 def check_whole(folder: Path) -> None:
@@ -72,66 +124,72 @@ def check_whole(folder: Path) -> None:
             assert path.read_text().rstrip().endswith("</html>")
 
 
-@pytest.fixture(scope="module")
-def job(tmp_path_factory: pytest.TempPathFactory, ball: Asset) -> tuple[Path, float]:
-    """A folder with an input, and the seconds of computing that the job takes."""
-    if not Path("/proc/self/stat").exists():
-        pytest.skip("needs /proc to know how far a run is")
-    folder = tmp_path_factory.mktemp("job")
-    save(ball, folder / "in.glb")
-    process = start(folder, "--out", "whole.glb")
-    seconds = 0.0
-    while process.poll() is None:
-        try:
-            seconds = processor_seconds(process)
-        except (OSError, IndexError):
-            break
-        time.sleep(0.02)
-    error = process.communicate(timeout=120)[1]
-    assert process.returncode == 0, error
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A folder with an input."""
+    save(make_asset(12, 24, 32), tmp_path / "in.glb")
+    return tmp_path
+
+
+def check_killed(folder: Path, code: int, error: str, before: bytes) -> None:
+    assert code in (0, -signal.SIGKILL), error
+    assert "Traceback" not in error, error
     check_whole(folder)
-    return folder, seconds
+    assert (folder / "in.glb").read_bytes() == before
 
 
-def kill(job: tuple[Path, float], tmp_path: Path, moments: np.ndarray, suffix: str) -> None:
-    folder, seconds = job
-    (tmp_path / "in.glb").write_bytes((folder / "in.glb").read_bytes())
-    before = (tmp_path / "in.glb").read_bytes()
-    codes = []
-    for share in moments:
-        process = start(tmp_path, "--out", f"low{suffix}", "--checkpoint", "state")
-        code, _ = stopped_at(process, share * seconds, signal.SIGKILL)
-        assert code in (0, -signal.SIGKILL)
-        check_whole(tmp_path)
-        assert (tmp_path / "in.glb").read_bytes() == before
-        codes.append(code)
-    assert -signal.SIGKILL in codes
+def test_killed_runs_leave_no_broken_files(folder: Path) -> None:
+    before = (folder / "in.glb").read_bytes()
+    more = ("--steps", "2", "--out", "low.glb", "--checkpoint", "state")
+    # one run after the other over what the last one left: nothing, a checkpoint, a result
+    for name, there in (
+        ("fit.npz", set()),
+        ("low.glb", {"state/fit.npz"}),
+        ("report.html", {"state/fit.npz", "low.glb"}),
+    ):
+        code, error = run_to_event(folder, "os.rename", name, signal.SIGKILL, *more)
+        assert code == -signal.SIGKILL, error
+        check_killed(folder, code, error, before)
+        for path in ("state/fit.npz", "low.glb", "low.report/report.html"):
+            assert (folder / path).exists() == (path in there), (name, path)
+    code, error = run(folder, *more)
+    assert code == 0, error
+    check_whole(folder)
+    assert (folder / "low.report" / "report.html").exists()
 
 
-def interrupt(job: tuple[Path, float], tmp_path: Path, moments: np.ndarray) -> None:
-    folder, seconds = job
-    (tmp_path / "in.glb").write_bytes((folder / "in.glb").read_bytes())
-    cut = 0
-    for k, share in enumerate(moments):
-        process = start(tmp_path, "--out", f"low{k}.glb")
-        code, error = stopped_at(process, max(share * seconds, 0.5), signal.SIGINT)
-        assert "Traceback" not in error and "Exception ignored" not in error, error
-        assert code in (0, 130), error
-        if code == 0:
-            assert (tmp_path / f"low{k}.glb").exists()
-        else:  # before the fit, or in the instant after the result was renamed
-            assert "error: interrupted; what was written is complete" in error
-        check_whole(tmp_path)
-        cut += "interrupted" in error  # in the line of an error, or in the note of a fit that ended early
-    assert cut
+ENDED = "error: interrupted; what was written is complete"
 
 
-def test_killed_runs_leave_no_broken_files(job: tuple[Path, float], tmp_path: Path) -> None:
-    kill(job, tmp_path, np.array([0.6, 0.8, 0.97]), ".glb")
+def test_runs_interrupted_before_the_fit_write_nothing(folder: Path) -> None:
+    code, error = run_to_event(folder, "import", "xatlas", signal.SIGINT, "--steps", "2", "--out", "low.glb")
+    assert (code, error.strip()) == (130, ENDED)
+    assert [p.name for p in folder.iterdir()] == ["in.glb"]
 
 
-def test_interrupted_runs_end_cleanly(job: tuple[Path, float], tmp_path: Path) -> None:
-    interrupt(job, tmp_path, np.array([0.3, 0.6, 0.9]))
+def test_interrupted_fits_write_the_best_state(folder: Path) -> None:
+    # without the interrupt, the fit would go on for hours
+    process = start(folder, COMMAND, *JOB, "--steps", "10000000", "--out", "low.glb", "--no-report")
+    assert process.stderr is not None
+    line = process.stderr.readline()
+    while line and "step 1" not in line:
+        line = process.stderr.readline()
+    process.send_signal(signal.SIGINT)
+    code, error = ended(process)
+    assert code == 0, error
+    assert "Traceback" not in error and "Exception ignored" not in error, error
+    assert "interrupted after" in error and "this is the best state so far" in error
+    assert load(folder / "low.glb").triangle_count <= 150
+
+
+def test_an_interrupt_after_the_result_ends_the_report_alone(folder: Path) -> None:
+    more = ("--steps", "2", "--out", "low.glb")
+    code, error = run_to_event(folder, "os.rename", "report.html", signal.SIGINT, *more)
+    assert code == 0, error
+    assert "Traceback" not in error and "Exception ignored" not in error, error
+    assert "interrupted while the report was made: the result is complete" in error
+    check_whole(folder)
+    assert (folder / "low.glb").exists() and not (folder / "low.report" / "report.html").exists()
 
 
 def test_an_interrupted_recording_is_an_interrupt() -> None:
@@ -150,15 +208,43 @@ def test_an_interrupted_recording_is_an_interrupt() -> None:
         np.testing.assert_array_equal(run(squared, mi.Float(2, 3)), [4, 9])
 
 
+@pytest.fixture(scope="module")
+def calls(tmp_path_factory: pytest.TempPathFactory) -> int:
+    """How many calls of our functions a whole run makes."""
+    folder = tmp_path_factory.mktemp("calls")
+    save(make_asset(12, 24, 32), folder / "in.glb")
+    code, error = run_to_call(folder, 0, signal.SIGINT, "--steps", "4", "--out", "low.glb", "--checkpoint", "state")
+    assert code == 0, error
+    return int((folder / "calls.txt").read_text())
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("suffix", [".glb", ".gltf"])
-def test_runs_killed_at_fifty_moments(job: tuple[Path, float], tmp_path: Path, suffix: str) -> None:
-    kill(job, tmp_path, np.random.default_rng(0).random(50), suffix)
+def test_runs_killed_at_fifty_moments(folder: Path, calls: int, suffix: str) -> None:
+    before = (folder / "in.glb").read_bytes()
+    codes = []
+    for number in np.random.default_rng(0).integers(1, calls, 50):
+        more = ("--steps", "4", "--out", f"low{suffix}", "--checkpoint", "state")
+        code, error = run_to_call(folder, number, signal.SIGKILL, *more)
+        check_killed(folder, code, error, before)
+        codes.append(code)
+    assert -signal.SIGKILL in codes
 
 
 @pytest.mark.slow
-def test_runs_interrupted_at_fifty_moments(job: tuple[Path, float], tmp_path: Path) -> None:
-    interrupt(job, tmp_path, np.random.default_rng(1).random(50))
+def test_runs_interrupted_at_fifty_moments(folder: Path, calls: int) -> None:
+    cut = 0
+    for k, number in enumerate(np.random.default_rng(1).integers(1, calls, 50)):
+        code, error = run_to_call(folder, number, signal.SIGINT, "--steps", "4", "--out", f"low{k}.glb")
+        assert "Traceback" not in error and "Exception ignored" not in error, error
+        assert code in (0, 130), error
+        if code == 0:
+            assert (folder / f"low{k}.glb").exists()
+        else:  # before the fit, or in the instant after the result was renamed
+            assert ENDED in error
+        check_whole(folder)
+        cut += "interrupted" in error  # in the line of an error, or in the note of a fit that ended early
+    assert cut
 
 
 FULL = """
