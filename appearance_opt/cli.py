@@ -21,6 +21,8 @@ BEGAN = time.perf_counter()
 INTERRUPTED = 130
 """Exit code after a Ctrl-C that ended a command: 128 + SIGINT, as shells have it."""
 
+VARIANT = "Variant: set=name for USD (repeatable), a name for glTF."
+
 INTERRUPTION = "interrupted; what was written is complete"
 
 app = typer.Typer(
@@ -149,7 +151,7 @@ def simplify(
     refine: RefineOption = None,
     missing_textures: MissingTexturesOption = None,
     root: RootOption = None,
-    variant: Annotated[list[str] | None, typer.Option(help="USD variant: set=name (repeatable).")] = None,
+    variant: Annotated[list[str] | None, typer.Option(help=VARIANT)] = None,
     device: DeviceOption = None,
     report: ReportOption = None,
     no_report: NoReportOption = False,
@@ -229,7 +231,7 @@ def bake(
     refine: RefineOption = None,
     missing_textures: MissingTexturesOption = None,
     root: RootOption = None,
-    variant: Annotated[list[str] | None, typer.Option(help="USD variant of HIGH: set=name (repeatable).")] = None,
+    variant: Annotated[list[str] | None, typer.Option(help=f"HIGH: {VARIANT}")] = None,
     device: DeviceOption = None,
     joint: Annotated[bool | None, typer.Option("--joint", help="Fit LOW's shape and a displacement, too.")] = None,
     subdivision: Annotated[str | None, typer.Option(help="Tessellation with --joint: 3, or 1,2,3.")] = None,
@@ -302,7 +304,7 @@ def compare(
     refine: Annotated[int, typer.Option(help="Level to which USD subdivision surfaces are refined.")] = 1,
     missing_textures: MissingTexturesOption = "error",
     root: RootOption = None,
-    variant: Annotated[list[str] | None, typer.Option(help="USD variant of REFERENCE: set=name (repeatable).")] = None,
+    variant: Annotated[list[str] | None, typer.Option(help=f"REFERENCE: {VARIANT}")] = None,
 ) -> None:
     """Measure how different two assets look: PSNR, FLIP, silhouettes."""
     from appearance_opt.jobs.compare import compare as run
@@ -343,7 +345,7 @@ def inspect(
     refine: Annotated[int, typer.Option(help="Level to which USD subdivision surfaces are refined.")] = 1,
     missing_textures: MissingTexturesOption = "error",
     root: RootOption = None,
-    variant: Annotated[list[str] | None, typer.Option(help="USD variant: set=name (repeatable).")] = None,
+    variant: Annotated[list[str] | None, typer.Option(help=VARIANT)] = None,
 ) -> None:
     """Say what is in an asset and what is wrong with it."""
     from dataclasses import asdict
@@ -398,8 +400,8 @@ def _print_result(out: Path, result: Any, folder: Path | None) -> None:
 def _variants(given: list[str] | None) -> dict[str, str] | None:
     out = {}
     for text in given or []:
-        name, separator, choice = text.partition("=")
-        if not separator or not name or not choice:
-            raise InputError(f"--variant {text}: write it as set=name")
+        name, separator, choice = text.partition("=") if "=" in text else ("", "", text)
+        if (separator and not name) or not choice:
+            raise InputError(f"--variant {text}: write it as set=name for USD, as a name for glTF")
         out[name] = choice
     return out or None

@@ -28,8 +28,9 @@ def load(
     """Read an asset; the suffix chooses the format. Units become metres, the up axis +Y.
 
     ``refine``: level to which USD subdivision surfaces are refined. ``variants``: USD variant
-    selections by set name, instead of those in the file. ``missing_textures``: "error" refuses an asset that names
-    a texture file which is not there, "ignore" goes on with the material's constants (without a normal map, if it is
+    selections by set name, instead of those in the file; for glTF, {"": name} chooses one of its material variants.
+    ``missing_textures``: "error" refuses an asset that names a texture file which is not there, "ignore" goes on
+    with the material's constants (without a normal map, if it is
     that) and a note. ``root``: folder in which files that it refers to may lie, beside its own. ``keep_layout``:
     for a mesh to be baked onto, whose vertices and texture coordinates stay as the file has them: no transform of a
     texture is applied to them, and a glTF mesh without normals is not taken apart into flat triangles. Harmless
@@ -67,7 +68,9 @@ def _read(
     if suffix in (".glb", ".gltf"):
         from appearance_opt.asset.gltf_read import load_gltf
 
-        return load_gltf(path, companions, keep_layout)
+        return load_gltf(path, companions, keep_layout, _name_of_variant(variants, path))
+    if variants and suffix in (".obj", ".ply", ".stl"):
+        raise InputError(f"{path}: {suffix} files have no variants; leave --variant out")
     if suffix == ".obj":
         from appearance_opt.asset.obj import load_obj
 
@@ -79,6 +82,14 @@ def _read(
     from appearance_opt.asset.usd_read import load_usd
 
     return load_usd(path, refine, variants, companions, keep_layout)
+
+
+def _name_of_variant(variants: dict[str, str] | None, path: Path) -> str | None:
+    """glTF has one set of variants, which has no name: what looks like one belongs to the variant's name."""
+    names = ["=".join(filter(None, v)) for v in (variants or {}).items()]
+    if len(names) > 1:
+        raise InputError(f"{path}: --variant {', '.join(names)}: glTF files show one variant at a time")
+    return names[0] if names else None
 
 
 def save(asset: Asset, path: str | Path) -> None:

@@ -39,6 +39,12 @@ class Companions:
     def find(self, reference: str, owner: Path, percent_encoded: bool = False) -> Path:
         """Path of a file that ``owner`` refers to; see ``_find``."""
         found = self._find(reference, owner, percent_encoded)
+        named = PureWindowsPath(unquote(reference) if percent_encoded else reference).parts
+        there = found.parts[-len(named) :]
+        if there != named and [p.lower() for p in there] == [p.lower() for p in named]:
+            self.note(
+                f"'{reference}' differs from the name of the file in upper and lower case: '{found.name}' is taken"
+            )
         self.files.append(found.resolve())
         return found
 

@@ -52,6 +52,10 @@ class Document:
         """A top-level array of the JSON, empty when absent."""
         return self.json.get(kind, [])
 
+    def extension(self, name: str) -> dict[str, Any]:
+        """What an extension says of the file as a whole, empty when absent."""
+        return self.json.get("extensions", {}).get(name, {})
+
     def uri(self, uri: str) -> bytes:
         """Bytes behind a data URI or a path relative to the file."""
         if uri.startswith("data:"):

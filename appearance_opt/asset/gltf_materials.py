@@ -18,20 +18,41 @@ if TYPE_CHECKING:
 
 STRENGTH = "KHR_materials_emissive_strength"
 SPECULAR = "KHR_materials_pbrSpecularGlossiness"
-READ_EXTENSIONS = (STRENGTH, SPECULAR, "KHR_texture_transform", "EXT_texture_webp")
+VARIANTS = "KHR_materials_variants"
+READ_EXTENSIONS = (STRENGTH, SPECULAR, VARIANTS, "KHR_texture_transform", "EXT_texture_webp")
 """Extensions of materials and textures that are heeded."""
 
 _WRAPS: dict[int, Wrap] = {10497: "repeat", 33071: "clamp", 33648: "mirror"}
 
 
 class MaterialReader:
-    """Materials of a file, each read once."""
+    """Materials of a file, each read once, as its ``variant`` chooses them. Raises InputError for one that it does not
+    have."""
 
-    def __init__(self, document: Document) -> None:
+    def __init__(self, document: Document, variant: str | None = None) -> None:
         self.document, self.path = document, document.path
         self.note = document.companions.note
         self._images: dict[int, NDArray | None] = {}
         self._materials: dict[int | None, Material] = {}
+        self._variant = self._number(variant)
+
+    def _number(self, variant: str | None) -> int | None:
+        """Index of a variant, which several may share their names with: the first."""
+        names = [v.get("name", "") for v in self.document.extension(VARIANTS).get("variants", [])]
+        if variant is None:
+            if names:
+                self.note(f"shown without a variant; there are {_quoted(names)} (--variant NAME)")
+            return None
+        if variant not in names:
+            raise InputError(f"{self.path}: has no variant '{variant}'; there are {_quoted(names) or 'none'}")
+        return names.index(variant)
+
+    def of(self, primitive: dict[str, Any]) -> int | None:
+        """Index of the material that a primitive wears."""
+        for mapping in primitive.get("extensions", {}).get(VARIANTS, {}).get("mappings", []):
+            if self._variant in mapping["variants"]:
+                return mapping["material"]
+        return primitive.get("material")
 
     def read(self, index: int | None) -> tuple[Material, int]:
         """(material, index of the texture coordinates that its textures use)."""
@@ -171,3 +192,7 @@ class MaterialReader:
         else:
             data = self.document.uri(image["uri"])
         return images.decode(data, f"{self.path}, image {image.get('name') or index} of material '{material}'")
+
+
+def _quoted(names: list[str]) -> str:
+    return ", ".join(f"'{n}'" for n in names)

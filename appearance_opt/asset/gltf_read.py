@@ -31,21 +31,22 @@ _VISUAL = ("KHR_materials_", "KHR_lights_", "EXT_lights_", "KHR_animation_pointe
 lights. They are ignored with a note even where a file calls them required."""
 
 
-def load_gltf(path: Path, companions: Companions, keep_layout: bool = False) -> Asset:
-    """Read a .gltf or .glb file. ``keep_layout``: see ``asset.load``. Raises InputError."""
+def load_gltf(path: Path, companions: Companions, keep_layout: bool = False, variant: str | None = None) -> Asset:
+    """Read a .gltf or .glb file. ``keep_layout``: see ``asset.load``; ``variant``: name of a KHR_materials_variants
+    variant. Raises InputError."""
     document = Document(path, companions)
     try:
-        return _Reader(document, keep_layout).asset()
+        return _Reader(document, keep_layout, variant).asset()
     except (KeyError, IndexError, TypeError, AttributeError, ValueError, OverflowError, RecursionError) as error:
         raise InputError(f"{path}: the glTF structure is broken ({type(error).__name__}: {error})") from error
 
 
 class _Reader:
-    def __init__(self, document: Document, keep_layout: bool) -> None:
+    def __init__(self, document: Document, keep_layout: bool, variant: str | None) -> None:
         self.document, self.keep_layout = document, keep_layout
         self.path = document.path
         self.note = document.companions.note
-        self.materials = MaterialReader(document)
+        self.materials = MaterialReader(document, variant)
         self.nodes = Nodes(document)
 
     def asset(self) -> Asset:
@@ -139,7 +140,7 @@ class _Reader:
             tangents = read("TANGENT").astype(np.float64) if "TANGENT" in attributes else None
         if "COLOR_0" in attributes:
             colors = read("COLOR_0")[:, :3].astype(np.float32)
-        material, channel = self.materials.read(primitive.get("material"))
+        material, channel = self.materials.read(self.materials.of(primitive))
         uvs = _float(read(f"TEXCOORD_{channel}")) if f"TEXCOORD_{channel}" in attributes else None
         if "skin" in node and "JOINTS_0" in attributes:
             places = [self.nodes.skinned(node["skin"], attributes, read)]

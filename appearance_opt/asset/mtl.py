@@ -10,7 +10,7 @@ import numpy as np
 
 from appearance_opt.asset import images, uv_frames
 from appearance_opt.asset.packing import pack_orm
-from appearance_opt.asset.paths import read_bytes
+from appearance_opt.asset.paths import read_text
 from appearance_opt.asset.types import Material, Texture, Wrap
 from appearance_opt.errors import InputError
 
@@ -75,7 +75,7 @@ class MaterialReader:
         """Add the materials of a file. Raises InputError."""
         statements: dict[str, dict[str, str]] = {}
         current: dict[str, str] = {}
-        for line in read_bytes(path).decode("utf-8", errors="replace").splitlines():
+        for line in read_text(path).splitlines():
             if line.startswith(WITHOUT_MAP):
                 line = LOST + line[len(WITHOUT_MAP) :]
             words = line.split(None, 1)

@@ -10,7 +10,7 @@ import numpy as np
 
 from appearance_opt.asset import uv_frames
 from appearance_opt.asset.mtl import MaterialReader
-from appearance_opt.asset.paths import read_bytes
+from appearance_opt.asset.paths import read_text
 from appearance_opt.asset.polygons import Polygons, triangulate
 from appearance_opt.asset.types import Asset, Material, Mesh, srgb_to_linear
 from appearance_opt.errors import InputError, MissingFileError
@@ -27,7 +27,7 @@ MAX_INDEX = 2**31 - 1
 def load_obj(path: Path, companions: Companions, keep_layout: bool = False) -> Asset:
     """Read an OBJ file and its materials. ``keep_layout``: see ``asset.load``. Raises InputError."""
     path = Path(path)
-    text = read_bytes(path).decode("utf-8", errors="replace").replace("\\\n", " ")
+    text = read_text(path).replace("\\\n", " ")
     parser = _Parser(path, companions)
     for number, line in enumerate(text.splitlines(), 1):
         try:

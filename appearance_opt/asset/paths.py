@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import os
 import re
 import tempfile
@@ -17,8 +18,9 @@ if TYPE_CHECKING:
 
 
 def resolve(reference: str, owner: Path, percent_encoded: bool = False, root: Path | None = None) -> Path:
-    """Path of a file that ``owner`` refers to. Raises InputError when it lies neither in owner's folder nor in ``root``
-    (an asset must not read what it does not own), MissingFileError when it does not exist."""
+    """Path of a file that ``owner`` refers to, or of the only one whose name differs from that in upper and lower case:
+    many writers work where that makes no difference. Raises InputError when it lies neither in owner's folder nor in
+    ``root`` (an asset must not read what it does not own), MissingFileError when it does not exist."""
     text = unquote(reference) if percent_encoded else reference
     if "\0" in text or (urlparse(text).scheme and len(urlparse(text).scheme) > 1):
         raise InputError(f"{owner}: refers to '{reference}', which is not a file beside it")
@@ -29,9 +31,13 @@ def resolve(reference: str, owner: Path, percent_encoded: bool = False, root: Pa
     except (OSError, ValueError, RuntimeError):  # names too long for the file system, loops of links
         raise InputError(f"{owner}: refers to '{reference[:80]}', which is no file name") from None
     check_inside(path, owner, reference, root)
-    if not exists:
+    if exists:
+        return path
+    found = differing_in_case(path)
+    if found is None:
         raise MissingFileError(f"{owner}: refers to '{reference}', which does not exist")
-    return path
+    check_inside(found, owner, reference, root)
+    return found.resolve()
 
 
 def check_inside(path: Path, owner: Path, reference: str, root: Path | None = None) -> None:
@@ -42,6 +48,36 @@ def check_inside(path: Path, owner: Path, reference: str, root: Path | None = No
             f"{owner}: refers to '{reference}' outside its own folder; copy it beside the file, or allow the folder "
             "with --root"
         )
+
+
+def differing_in_case(path: Path) -> Path | None:
+    """The one file that there is under a name which differs from ``path`` in upper and lower case only; None if there
+    is none, or more than one."""
+    found = [Path(path.anchor)]
+    for part in path.parts[1:]:
+        within = [p / part for p in found if (p / part).exists()]
+        found = within or [q for p in found if p.is_dir() for q in _listed(p) if q.name.lower() == part.lower()]
+    files = [p for p in found if p.is_file()]
+    return files[0] if len(files) == 1 else None
+
+
+def _listed(folder: Path) -> list[Path]:
+    try:
+        return list(folder.iterdir())
+    except OSError:  # it may be entered, but not listed
+        return []
+
+
+def read_text(path: Path, encoding: str = "utf-8") -> str:
+    """Text of a file, without its byte order mark, which also says how it is encoded: UTF-8 or UTF-16. Bytes that are
+    no text in that become U+FFFD. Raises InputError when it cannot be read or is empty."""
+    data = read_bytes(path)
+    marks = ((codecs.BOM_UTF8, "utf-8"), (codecs.BOM_UTF16_LE, "utf-16-le"), (codecs.BOM_UTF16_BE, "utf-16-be"))
+    for mark, marked in marks:
+        if data.startswith(mark):
+            data, encoding = data[len(mark) :], marked
+            break
+    return data.decode(encoding, errors="replace")
 
 
 def read_bytes(path: Path) -> bytes:

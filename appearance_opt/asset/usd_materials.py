@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     from appearance_opt.asset.companions import Companions
 
 _WRAPS = {"repeat": "repeat", "clamp": "clamp", "mirror": "mirror", "black": "clamp"}
+_PURPOSES = ("full", "preview", "")
+"""Purposes of bindings in the order in which they are taken; the last is that for all."""
 _CHANNEL = {"r": 0, "g": 1, "b": 2, "a": 3}
 
 
@@ -104,15 +106,23 @@ class MaterialReader:
         return self._by_side[key]
 
     def _bound_prim(self, prim: Any) -> Any:
+        """The material bound for the purpose "full", else for "preview", else for all. ``ComputeBoundMaterial`` goes on
+        from each purpose to bindings for all of them."""
         from pxr import UsdShade
 
-        return UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()[0]
+        api = UsdShade.MaterialBindingAPI(prim)
+        for purpose in _PURPOSES:
+            material, binding = api.ComputeBoundMaterial(purpose)
+            if material and _purpose(binding) == purpose:
+                return material
+        return material
 
     def _unresolved(self, prim: Any) -> str | None:
         """Name of a bound material that does not exist on the stage."""
         from pxr import UsdShade
 
-        targets = UsdShade.MaterialBindingAPI(prim).GetDirectBindingRel().GetTargets()
+        api = UsdShade.MaterialBindingAPI(prim)
+        targets: list[Any] = next((t for p in _PURPOSES if (t := api.GetDirectBindingRel(p).GetTargets())), [])
         return targets[0].name if targets and not self.stage.GetPrimAtPath(targets[0]) else None
 
     def _bound(self, prim: Any) -> Material:
@@ -280,6 +290,15 @@ class MaterialReader:
             else:
                 self._pixels[text] = images.read(self.companions.find(text, self.path))
         return self._pixels[text]
+
+
+def _purpose(binding: Any) -> str:
+    """The purpose for which a relationship binds a material: "material:binding[:PURPOSE]", or, for a collection,
+    "material:binding:collection[:PURPOSE]:NAME" (UsdShadeMaterialBindingAPI)."""
+    words = binding.GetName().split(":")[2:]
+    if words[:1] == ["collection"]:
+        words = words[1:-1]
+    return words[0] if words else ""
 
 
 def _input(shader: Any, key: str, default: Any) -> tuple[Any, Any, str]:

@@ -76,6 +76,8 @@ def _select(stage: Any, variants: dict[str, str], path: Path) -> None:
     prim = stage.GetDefaultPrim()
     stage.SetEditTarget(stage.GetSessionLayer())
     for name, choice in variants.items():
+        if not name:
+            raise InputError(f"{path}: --variant {choice}: write it as set=name")
         sets = prim.GetVariantSets() if prim else None
         if sets is None or not sets.HasVariantSet(name) or choice not in sets.GetVariantSet(name).GetVariantNames():
             have = {n: sets.GetVariantSet(n).GetVariantNames() for n in sets.GetNames()} if sets else {}
