@@ -36,7 +36,11 @@ app = typer.Typer(
 
 def main() -> None:
     """Entry point: every expected failure is one line and exit code 2."""
-    logging.basicConfig(level=logging.WARNING, format="%(levelname)s: %(message)s")
+    # what libraries log of the files they read is no message of ours: errors and notes say it
+    logging.getLogger().addHandler(logging.NullHandler())
+    ours = logging.StreamHandler()
+    ours.setFormatter(logging.Formatter("%(levelname)s: %(message)s"))
+    logging.getLogger("appearance_opt").addHandler(ours)
     # schedulers of clusters end a job so: like Ctrl-C, it keeps the best state
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:

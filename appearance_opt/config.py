@@ -281,7 +281,7 @@ def read_toml(path: Path, names: frozenset[str] = OPTION_NAMES) -> dict[str, Any
         data = tomllib.loads(Path(path).read_text(encoding="utf-8"))
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from error
-    except (ValueError, UnicodeDecodeError) as error:
+    except (ValueError, RecursionError) as error:  # arrays may be nested deeper than Python's stack
         raise InputError(f"{path}: not a valid TOML file ({error})") from error
     known = names | {"preset"}
     out: dict[str, Any] = {}

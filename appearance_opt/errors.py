@@ -1,8 +1,22 @@
 """The exceptions a user can meet. The command line prints their message as one line, exit code 2."""
 
 
+def one_line(text: str) -> str:
+    """``text`` on one line that is safe to print: control characters, marks that turn the direction of writing and lone
+    surrogates, which names in files may hold, become escapes such as ``\\x1b``."""
+    line = " ".join(text.split())
+    return line if line.isprintable() else "".join(c if c.isprintable() else _escape(c) for c in line)
+
+
+def _escape(character: str) -> str:
+    return character.encode("unicode_escape").decode("ascii")
+
+
 class AppearanceError(Exception):
-    """Base of every error that this package raises on purpose."""
+    """Base of every error that this package raises on purpose. Its message is one line of printable text."""
+
+    def __init__(self, message: str = "") -> None:
+        super().__init__(one_line(message))
 
 
 class InputError(AppearanceError):

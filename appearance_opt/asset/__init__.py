@@ -49,17 +49,15 @@ def load(
         raise InputError(f"--root {root}: no such folder")
     import numpy as np
 
+    from appearance_opt.asset.door import reading, with_text_names
     from appearance_opt.asset.validate import repair
 
-    try:
-        # numbers that do not fit a float32 become infinite, which ``repair`` refuses by name
-        with np.errstate(over="ignore", invalid="ignore"):
-            companions = Companions(missing_textures, None if root is None else Path(root))
-            asset = _read(path, suffix, refine, variants, companions, keep_layout)
-            asset = replace(asset, files=(path.resolve(), *dict.fromkeys(companions.files)))
-            return repair(asset, str(path)) if mend else asset
-    except MemoryError as error:
-        raise InputError(f"{path}: asks for more memory than there is; it is damaged or too large") from error
+    # numbers that do not fit a float32 become infinite, which ``repair`` refuses by name
+    with reading(path), np.errstate(over="ignore", invalid="ignore"):
+        companions = Companions(missing_textures, None if root is None else Path(root))
+        asset = with_text_names(_read(path, suffix, refine, variants, companions, keep_layout))
+        asset = replace(asset, files=(path.resolve(), *dict.fromkeys(companions.files)))
+        return repair(asset, str(path)) if mend else asset
 
 
 def _read(

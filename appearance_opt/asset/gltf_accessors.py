@@ -39,7 +39,7 @@ class Document:
             self.json: dict[str, Any] = json.loads(text)
         except (ValueError, RecursionError) as error:
             raise InputError(f"{path}: not a glTF file, or cut short ({error})") from None
-        if not isinstance(self.json, dict) or "asset" not in self.json:
+        if not isinstance(self.json, dict) or not isinstance(self.json.get("asset"), dict):
             raise InputError(f"{path}: not a glTF file (no 'asset' object)")
         if not str(self.json["asset"].get("version", "")).startswith("2"):
             raise InputError(

@@ -34,11 +34,7 @@ lights. They are ignored with a note even where a file calls them required."""
 def load_gltf(path: Path, companions: Companions, keep_layout: bool = False, variant: str | None = None) -> Asset:
     """Read a .gltf or .glb file. ``keep_layout``: see ``asset.load``; ``variant``: name of a KHR_materials_variants
     variant. Raises InputError."""
-    document = Document(path, companions)
-    try:
-        return _Reader(document, keep_layout, variant).asset()
-    except (KeyError, IndexError, TypeError, AttributeError, ValueError, OverflowError, RecursionError) as error:
-        raise InputError(f"{path}: the glTF structure is broken ({type(error).__name__}: {error})") from error
+    return _Reader(Document(path, companions), keep_layout, variant).asset()
 
 
 class _Reader:

@@ -27,7 +27,8 @@ def decode(data: bytes, name: str) -> NDArray:
     Raises InputError when it cannot be read."""
     if not data:
         raise InputError(f"{name}: the image is empty")
-    # the Python bindings of OpenImageIO read from and write to named files only
+    # the Python bindings of OpenImageIO read from and write to named files only, and the name chooses the reader:
+    # one of ours, by what the data is, for a name may ask for readers that read no picture at all
     suffix = _suffix(data, name)
     if suffix == ".png":
         check_png(data, name)
@@ -39,10 +40,7 @@ def decode(data: bytes, name: str) -> NDArray:
 
 def read(path: Path) -> NDArray:
     """Pixels of an image file. Raises InputError naming the file."""
-    data = read_bytes(path)
-    if data.startswith(b"\x89PNG"):
-        check_png(data, str(path))
-    return _open(Path(path), str(path))
+    return decode(read_bytes(path), str(path))
 
 
 def check_png(data: bytes, name: str) -> None:

@@ -30,33 +30,58 @@ EXPANSION = 1024
 """Elements per byte that no compressed block exceeds: LZ4 makes at most 255 bytes of one, the integer coding at
 most four elements of a byte."""
 
+SURVIVED = 77
+"""Exit code of the probe when it has read all that can be read: none that Python itself uses."""
+
+PATIENCE, BYTES_PER_SECOND = 120.0, 1 << 20
+"""How long the probe may take (seconds), and how much of a file it reads per second at the least. It ends a reader
+that waits for ever (for a pipe that nobody writes to), never one that is slow."""
+
 PROBE = """
-import resource, sys
-resource.setrlimit(resource.RLIMIT_AS, (int(sys.argv[2]), -1))
-resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-from pxr import Usd
-stage = Usd.Stage.Open(sys.argv[1])
-for prim in Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies()):
-    for attribute in prim.GetAttributes():
-        try:
-            attribute.Get()
-        except Exception:
-            pass
+import os, resource, sys
+
+def limit(kind, wanted):
+    _, hard = resource.getrlimit(kind)
+    resource.setrlimit(kind, (wanted if hard == resource.RLIM_INFINITY else min(wanted, hard), hard))
+
+limit(resource.RLIMIT_AS, int(sys.argv[2]))
+limit(resource.RLIMIT_CORE, 0)
+try:
+    from pxr import Usd
+    stage = Usd.Stage.Open(sys.argv[1])
+    for root in (stage.GetPseudoRoot(), *stage.GetPrototypes()):
+        for prim in Usd.PrimRange(root):
+            for attribute in prim.GetAttributes():
+                try:
+                    attribute.Get()
+                except Exception:
+                    pass
+except MemoryError:
+    raise
+except Exception:
+    pass
+os._exit(int(sys.argv[3]))
 """
-"""Reads every value of a stage, in no more memory than the machine has. What it raises is of no interest: the reader
-will meet it again and tell."""
+"""Reads every value of a stage once, in no more memory than the machine has and the process may take. What it raises
+is of no interest: the reader will meet it again and tell."""
 
 
 def survives(path: Path) -> bool:
-    """Can USD read the file without crashing? Costs half a second: a process and the import of USD."""
+    """Can USD read the file without crashing or waiting for ever? Costs half a second: a process and the import of
+    USD."""
     if not sys.executable or os.name != "posix":
         return True
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    done = subprocess.run(
-        [sys.executable, "-c", PROBE, str(path), str(memory)],
-        stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
-    )  # fmt: skip
-    return done.returncode >= 0  # negative: ended by a signal
+    patience = PATIENCE + path.stat().st_size / BYTES_PER_SECOND
+    try:
+        done = subprocess.run(
+            [sys.executable, "-c", PROBE, str(path), str(memory), str(SURVIVED)],
+            stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+            timeout=patience,
+        )  # fmt: skip
+    except subprocess.TimeoutExpired:
+        return False
+    return done.returncode == SURVIVED
 
 
 def check_usd(data: bytes, path: Path) -> None:
@@ -73,12 +98,23 @@ def check_usd(data: bytes, path: Path) -> None:
     elif not re.search(rb"@[^@]*\.usd", data):
         return  # text that refers to no other layer
     if not survives(path):
-        raise InputError(f"{path}: the USD file is damaged (USD's reader crashes on it); export it again")
+        raise InputError(
+            f"{path}: the USD file is damaged (USD's reader crashes on it, waits for ever or runs out of memory); "
+            "export it again"
+        )
 
 
 def _check_package(data: bytes, path: Path) -> None:
+    """Raise InputError for a package whose directory promises other bytes than it has. Entries of a USDZ package are
+    stored plain (USDZ specification, "Zip constraints"), so that together they are shorter than the package."""
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as package:
+            entries = package.infolist()
+            packed = next((e.filename for e in entries if e.compress_type != zipfile.ZIP_STORED), None)
+            if packed is not None:
+                raise InputError(f"{path}: '{packed}' in the USDZ package is compressed; store it without compression")
+            if sum(max(e.file_size, e.compress_size) for e in entries) > len(data):
+                raise InputError(f"{path}: the USDZ package is damaged (its files overlap); export it again")
             bad = package.testzip()
     except (zipfile.BadZipFile, zlib.error, EOFError, OSError, ValueError, NotImplementedError, RuntimeError) as error:
         raise InputError(f"{path}: the USDZ package is damaged or cut short ({error}); export it again") from None

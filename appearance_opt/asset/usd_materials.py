@@ -12,6 +12,7 @@ import numpy as np
 from appearance_opt.asset import images, specular_glossiness, uv_frames
 from appearance_opt.asset.materialx import load_materialx
 from appearance_opt.asset.packing import pack_orm
+from appearance_opt.asset.paths import check_inside
 from appearance_opt.asset.specular_glossiness import Specular
 from appearance_opt.asset.types import Material, Mesh, Texture
 from appearance_opt.errors import MissingFileError
@@ -283,6 +284,7 @@ class MaterialReader:
             if "[" in text:  # inside a .usdz package
                 from pxr import Ar
 
+                check_inside(Path(text.split("[")[0]), self.path, text, self.companions.root)
                 opened = Ar.GetResolver().OpenAsset(Ar.ResolvedPath(text))
                 if not opened:
                     raise MissingFileError(f"{self.path}: refers to '{text}', which does not exist")

@@ -54,8 +54,6 @@ def load_usd(
         asset = _read_stage(path, refine, variants or {}, companions or Companions(), keep_layout)
     except Tf.ErrorException as error:
         raise InputError(f"{path}: not a readable USD file ({_text(error.__str__)})") from None
-    except (KeyError, IndexError, TypeError, ValueError, RuntimeError, OverflowError) as error:
-        raise InputError(f"{path}: the USD structure is broken ({type(error).__name__})") from error
     finally:
         warned = [_text(partial(getattr, w, "commentary")) for w in diagnostics.TakeUncoalescedDiagnostics()]
     return replace(asset, notes=asset.notes + tuple(f"USD: {text}" for text in dict.fromkeys(warned)))

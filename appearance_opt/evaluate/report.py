@@ -6,6 +6,7 @@ import base64
 import html
 import json
 import math
+import re
 import shutil
 import tempfile
 from dataclasses import asdict, dataclass, field
@@ -13,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from appearance_opt.asset.images import encode_png
+from appearance_opt.errors import one_line
 from appearance_opt.evaluate.metrics import Metrics
 from appearance_opt.evaluate.template import PAGE, SLIDER_SCRIPT, STYLE
 
@@ -85,13 +87,13 @@ def page(data: ReportData, encoded: dict[str, bytes]) -> str:
 
     views = "".join(_view_block(k, view, source) for k, view in enumerate(data.views))
     maps = "".join(
-        f'<figure><img src="{source(f"map_{_slug(n)}.png")}" alt="{html.escape(n)}"><figcaption>{html.escape(n)}'
+        f'<figure><img src="{source(f"map_{_slug(n)}.png")}" alt="{_html(n)}"><figcaption>{_html(n)}'
         "</figcaption></figure>"
         for n in data.maps
     )
-    notes = "".join(f"<li>{html.escape(n)}</li>" for n in data.notes)
+    notes = "".join(f"<li>{_html(n)}</li>" for n in data.notes)
     sections = {
-        "title": html.escape(data.title),
+        "title": _html(data.title),
         "style": STYLE,
         "script": SLIDER_SCRIPT,
         "metrics": _metrics_table(data.metrics),
@@ -101,10 +103,13 @@ def page(data: ReportData, encoded: dict[str, bytes]) -> str:
         "facts": _facts_table(data.facts),
         "notes": f"<h2>Notes</h2><ul>{notes}</ul>" if notes else "",
     }
-    out = PAGE
-    for name, text in sections.items():
-        out = out.replace("{{" + name + "}}", text)
-    return out
+    # in one pass: a name that looks like a place of the template stays a name
+    return re.sub(r"\{\{(\w+)\}\}", lambda place: sections[place[1]], PAGE)
+
+
+def _html(text: object) -> str:
+    """Text of a file or of an option as a page shows it: printable, on one line, without markup."""
+    return html.escape(one_line(str(text)))
 
 
 def curve_svg(curve: list[tuple[float, int, float, float]], width: int = 720, height: int = 240) -> str:
@@ -146,8 +151,8 @@ def _view_block(index: int, view: dict[str, Any], source: Any) -> str:
         '<span class="l">reference</span><span class="r">result</span></div>'
     )
     others = "".join(
-        f'<figure><img src="{source(f"view{index}_{_slug(n)}.png")}" alt="{html.escape(n)}"><figcaption>'
-        f"{html.escape(n)}</figcaption></figure>"
+        f'<figure><img src="{source(f"view{index}_{_slug(n)}.png")}" alt="{_html(n)}"><figcaption>'
+        f"{_html(n)}</figcaption></figure>"
         for n in view
         if n not in ("reference", "result")
     )
@@ -162,7 +167,7 @@ def _metrics_table(metrics: dict[str, Metrics]) -> str:
         ("Silhouette IoU", "silhouette_iou", "{:.4f}"),
         ("Silhouette shift (pixels)", "silhouette_shift", "{:.3f}"),
     )
-    head = "".join(f"<th>{html.escape(n)}</th>" for n in metrics)
+    head = "".join(f"<th>{_html(n)}</th>" for n in metrics)
     body = "".join(
         f"<tr><td>{label}</td>"
         + "".join(f"<td>{form.format(getattr(m, key))}</td>" for m in metrics.values())
@@ -173,7 +178,7 @@ def _metrics_table(metrics: dict[str, Metrics]) -> str:
 
 
 def _facts_table(facts: dict[str, Any]) -> str:
-    rows = "".join(f"<tr><td>{html.escape(str(k))}</td><td>{html.escape(str(v))}</td></tr>" for k, v in facts.items())
+    rows = "".join(f"<tr><td>{_html(k)}</td><td>{_html(v)}</td></tr>" for k, v in facts.items())
     return f"<table class='facts'>{rows}</table>"
 
 
