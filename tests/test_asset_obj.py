@@ -97,14 +97,43 @@ def test_a_bump_map_of_heights_is_dropped_with_a_note(tmp_path: Path, pixels: np
 
 
 @pytest.mark.parametrize(
-    ("mtl", "noted"),
+    ("mtl", "opacity"),
     [
-        ("d 1.00", False), ("d 1", False), ("d 0.5", True), ("d -halo 0.5", True), ("Tr 0", False), ("Tr 0.7", True),
-        ("Tr 0.7\nd 1.0", False),
+        ("d 1.00", 1), ("d 1", 1), ("d 0.5", 0.5), ("d -halo 0.5", 0.5), ("Tr 0", 1), ("Tr 0.75", 0.25),
+        ("Tr 0.7\nd 1.0", 1), ("d 0", 1), ("Tr 1", 1),
     ],
 )  # fmt: skip
-def test_transparency_is_noted_where_there_is_some(tmp_path: Path, mtl: str, noted: bool) -> None:
-    assert any("transparency" in n for n in read(tmp_path, mtl).notes) is noted
+def test_dissolve_becomes_opacity(tmp_path: Path, mtl: str, opacity: float) -> None:
+    asset = read(tmp_path, mtl)
+    material = asset.meshes[0].material
+    assert (material.opacity, material.alpha_mode) == (opacity, "blend" if opacity < 1 else "opaque")
+    # exporters write so for all that they export
+    assert any("nothing of it is seen" in n for n in asset.notes) is (mtl in ("d 0", "Tr 1"))
+
+
+ALPHA = np.arange(16, dtype=np.uint8).reshape(4, 4, 1) * 17
+COLOR = np.full((4, 4, 3), (200, 100, 50), np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("mtl", "picture"),
+    [
+        ("map_d t.png", ALPHA),
+        ("d 0\nmap_d t.png", ALPHA),  # constants beside a map do not count
+        ("map_d t.png", np.concatenate([COLOR, ALPHA], axis=2)),  # a picture with alpha
+        ("map_d -imfchan g t.png", np.concatenate([COLOR[..., :1], ALPHA, COLOR[..., 1:]], axis=2)),
+        ("map_d t.png", np.concatenate([np.repeat(ALPHA, 3, axis=2), np.full_like(ALPHA, 255)], axis=2)),
+    ],
+)
+def test_maps_of_dissolve_become_alpha(tmp_path: Path, mtl: str, picture: np.ndarray) -> None:
+    material = read(tmp_path, f"map_Kd c.png\n{mtl}", t=picture, c=COLOR).meshes[0].material
+    np.testing.assert_array_equal(material.base_color_texture.pixels, np.concatenate([COLOR, ALPHA], axis=2))
+    assert (material.alpha_mode, material.opacity) == ("blend", 1)
+    alone = read(tmp_path, f"Kd 0.5 0.25 1\n{mtl}", t=picture).meshes[0].material
+    np.testing.assert_array_equal(alone.base_color_texture.pixels[..., 3:], ALPHA)
+    np.testing.assert_allclose(
+        alone.base_color_texture.linear()[..., :3] * alone.base_color, [[(0.5, 0.25, 1)] * 4] * 4
+    )
 
 
 def test_maps_that_are_not_read_are_noted(tmp_path: Path) -> None:

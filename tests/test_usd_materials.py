@@ -42,17 +42,39 @@ def test_the_specular_workflow_with_textures(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("inputs", "words"),
+    ("inputs", "mode", "opacity", "alpha"),
     [
-        ("float inputs:opacity.connect = </mat/t.outputs:r>", "by a texture)"),
-        ("float inputs:opacity.connect = </mat/t.outputs:r>\nfloat inputs:opacityThreshold = 0.5", "cut out at 0.5"),
-        ("float inputs:opacity = 0.5", "transparency ignored"),
-        ("float inputs:opacity = 1", None),
+        # the picture is (64, 192, 255) and has no alpha, which is 1 then
+        ("float inputs:opacity.connect = </mat/t.outputs:r>", "blend", 1, 64 / 255),
+        (
+            "float inputs:opacity.connect = </mat/t.outputs:r>\nfloat inputs:opacityThreshold = 0.3",
+            "mask",
+            1,
+            64 / 255,
+        ),
+        ("float inputs:opacity.connect = </mat/t.outputs:r>\nfloat inputs:opacityThreshold = 0.2", "opaque", 1, None),
+        ("float inputs:opacity.connect = </mat/t.outputs:a>", "opaque", 1, None),
+        ("float inputs:opacity = 0.5", "blend", 0.5, None),
+        ("float inputs:opacity = 0.5\nfloat inputs:opacityThreshold = 0.4", "opaque", 1, None),
+        ("float inputs:opacity = 1\nfloat inputs:opacityThreshold = 0.4", "opaque", 1, None),
     ],
 )
-def test_transparency_is_noted(tmp_path: Path, inputs: str, words: str | None) -> None:
-    notes = load(textured(tmp_path, inputs)).notes
-    assert any(words in n for n in notes) if words else not any("transparency" in n for n in notes)
+def test_opacity_becomes_alpha(tmp_path: Path, inputs: str, mode: str, opacity: float, alpha: float | None) -> None:
+    path = textured(tmp_path, inputs)
+    path.write_text(path.read_text().replace("float outputs:r\n", "float outputs:r\nfloat outputs:a\n"))
+    material = load(path).meshes[0].material
+    assert (material.alpha_mode, material.opacity) == (mode, opacity)
+    if alpha is not None:
+        np.testing.assert_allclose(material.base_color_texture.linear()[..., 3], alpha, atol=1e-6)
+        np.testing.assert_allclose(material.base_color_texture.linear()[..., :3], 1)
+
+
+def test_scale_and_bias_of_opacity_count(tmp_path: Path) -> None:
+    inputs = "float inputs:opacity.connect = </mat/t.outputs:r>\ncolor3f inputs:diffuseColor = (0.2, 0.4, 0.6)"
+    sampler = "float4 inputs:scale = (0.5, 1, 1, 1)\nfloat4 inputs:bias = (0.25, 0, 0, 0)"
+    material = load(textured(tmp_path, inputs, sampler)).meshes[0].material
+    np.testing.assert_allclose(material.base_color_texture.linear()[..., 3], 0.25 + 32 / 255, atol=1e-6)
+    np.testing.assert_allclose(material.base_color, (0.2, 0.4, 0.6), atol=1e-6)
 
 
 def material(name: str, varname: str) -> str:

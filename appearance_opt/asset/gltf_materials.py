@@ -5,10 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from appearance_opt.asset import images, specular_glossiness, uv_frames
-from appearance_opt.asset.types import Material, Mesh, Texture, Wrap
+from appearance_opt.asset.packing import with_occlusion
+from appearance_opt.asset.types import Material, Mesh, Texture, Volume, Wrap
 from appearance_opt.errors import InputError
 
 if TYPE_CHECKING:
@@ -19,7 +18,9 @@ if TYPE_CHECKING:
 STRENGTH = "KHR_materials_emissive_strength"
 SPECULAR = "KHR_materials_pbrSpecularGlossiness"
 VARIANTS = "KHR_materials_variants"
-READ_EXTENSIONS = (STRENGTH, SPECULAR, VARIANTS, "KHR_texture_transform", "EXT_texture_webp")
+TRANSMISSION, VOLUME, IOR = (f"KHR_materials_{name}" for name in ("transmission", "volume", "ior"))
+_TRANSPARENT = (TRANSMISSION, VOLUME, IOR)
+READ_EXTENSIONS = (STRENGTH, SPECULAR, *_TRANSPARENT, VARIANTS, "KHR_texture_transform", "EXT_texture_webp")
 """Extensions of materials and textures that are heeded."""
 
 _WRAPS: dict[int, Wrap] = {10497: "repeat", 33071: "clamp", 33648: "mirror"}
@@ -81,10 +82,11 @@ class MaterialReader:
 
     def _texture_infos(self, index: int | None) -> dict[str, dict[str, Any]]:
         """What a material says of its textures, by the name of ours."""
-        if index is None:
-            return {}
-        m = self.document.items("materials")[index]
-        pbr, specular = m.get("pbrMetallicRoughness", {}), m.get("extensions", {}).get(SPECULAR)
+        return {} if index is None else self._texture_infos_of(self.document.items("materials")[index])
+
+    def _texture_infos_of(self, m: dict[str, Any]) -> dict[str, dict[str, Any]]:
+        extensions = m.get("extensions", {})
+        pbr, specular = m.get("pbrMetallicRoughness", {}), extensions.get(SPECULAR)
         color, orm = pbr.get("baseColorTexture"), pbr.get("metallicRoughnessTexture")
         if specular is not None:  # both are made of both of its textures
             color = orm = specular.get("diffuseTexture", specular.get("specularGlossinessTexture"))
@@ -93,6 +95,8 @@ class MaterialReader:
             "orm_texture": orm,
             "normal_texture": m.get("normalTexture"),
             "emission_texture": m.get("emissiveTexture"),
+            "transmission_texture": extensions.get(TRANSMISSION, {}).get("transmissionTexture"),
+            "thickness_texture": extensions.get(VOLUME, {}).get("thicknessTexture"),
         }
         return {name: info for name, info in infos.items() if info is not None}
 
@@ -104,11 +108,10 @@ class MaterialReader:
             material = self._metallic(m.get("pbrMetallicRoughness", {}), name)
         else:
             material = self._converted(specular, name)
-        if "occlusionTexture" in m:
-            self.note("occlusion ignored (it is not part of the appearance under a moving light)")
         mode = {"MASK": "mask", "BLEND": "blend"}.get(m.get("alphaMode", "OPAQUE"), "opaque")
-        if mode != "opaque":
-            self.note(f"material '{name}': transparency ignored, drawn opaque")
+        material = self._transmissive(material, m.get("extensions", {}), name)
+        if "occlusionTexture" in m:
+            material = self._occluded(material, m, name, mode != "opaque" or material.transmission > 0)
         normal = m.get("normalTexture")
         emission, emission_texture = self._emission(m, name)
         return replace(
@@ -133,6 +136,44 @@ class MaterialReader:
             orm_texture=self._texture(pbr.get("metallicRoughnessTexture"), "linear", name),
             opacity=factor[3],
         )
+
+    def _transmissive(self, material: Material, extensions: dict[str, Any], name: str) -> Material:
+        """The material with what its extensions say of light that passes through it."""
+        share = float(extensions.get(TRANSMISSION, {}).get("transmissionFactor", 0.0))
+        if share == 0:
+            return material
+        inside = extensions.get(VOLUME)
+        volume = thickness = None
+        if inside is not None:
+            red, green, blue = (float(x) for x in inside.get("attenuationColor", (1, 1, 1)))
+            distance = float(inside.get("attenuationDistance", "inf"))
+            volume = Volume(float(inside.get("thicknessFactor", 0.0)), distance, (red, green, blue))
+            thickness = self._texture(inside.get("thicknessTexture"), "linear", name)
+        return replace(
+            material,
+            transmission=share,
+            transmission_texture=self._texture(extensions[TRANSMISSION].get("transmissionTexture"), "linear", name),
+            ior=float(extensions.get(IOR, {}).get("ior", 1.5)),
+            volume=volume,
+            thickness_texture=thickness,
+        )
+
+    def _occluded(self, material: Material, m: dict[str, Any], name: str, kept: bool) -> Material:
+        """The material with its occlusion in the red channel, if it may pass into a result as it is (``kept``)."""
+        if not kept:
+            self.note("occlusion ignored (it is not part of the appearance under a moving light)")
+            return material
+        info, orm = m["occlusionTexture"], m.get("pbrMetallicRoughness", {}).get("metallicRoughnessTexture")
+        if orm is not None and info["index"] == orm["index"]:
+            return replace(material, has_occlusion=True)
+        others = self._texture_infos_of(m)
+        if any(_place(info) != _place(other) for other in others.values()):
+            self.note(f"material '{name}': its occlusion lies elsewhere than its other textures: ignored")
+            return material
+        occlusion = self._texture(info, "linear", name)
+        if occlusion is None:
+            return material
+        return replace(material, orm_texture=with_occlusion(material.orm_texture, occlusion), has_occlusion=True)
 
     def _emission(self, m: dict[str, Any], name: str) -> tuple[tuple[float, float, float], Texture | None]:
         """(factor, texture) of what a material emits: nothing if the texture that says where is missing."""
@@ -181,9 +222,7 @@ class MaterialReader:
         pixels = self._images[source]
         if pixels is None:
             return None
-        if pixels.shape[2] < 3:  # grey, or grey and alpha
-            pixels = np.repeat(pixels[..., :1], 3, axis=2)
-        return Texture(pixels, space, wrap)  # type: ignore[arg-type]
+        return Texture(images.colored(pixels), space, wrap)  # type: ignore[arg-type]
 
     def _image(self, index: int, material: str) -> NDArray:
         image = self.document.items("images")[index]
@@ -196,3 +235,9 @@ class MaterialReader:
 
 def _quoted(names: list[str]) -> str:
     return ", ".join(f"'{n}'" for n in names)
+
+
+def _place(info: dict[str, Any]) -> tuple[int, str]:
+    """Which texture coordinates a texture uses, and where it lies in them."""
+    transform = info.get("extensions", {}).get("KHR_texture_transform", {})
+    return transform.get("texCoord", info.get("texCoord", 0)), str(sorted(transform.items()))

@@ -134,9 +134,11 @@ class _Reader:
         if "NORMAL" in attributes:
             normals = read("NORMAL").astype(np.float64)
             tangents = read("TANGENT").astype(np.float64) if "TANGENT" in attributes else None
-        if "COLOR_0" in attributes:
-            colors = read("COLOR_0")[:, :3].astype(np.float32)
         material, channel = self.materials.read(self.materials.of(primitive))
+        if "COLOR_0" in attributes:
+            colors = read("COLOR_0").astype(np.float32)
+            if material.alpha_mode == "opaque":  # their alpha means nothing
+                colors = colors[:, :3]
         uvs = _float(read(f"TEXCOORD_{channel}")) if f"TEXCOORD_{channel}" in attributes else None
         if "skin" in node and "JOINTS_0" in attributes:
             places = [self.nodes.skinned(node["skin"], attributes, read)]

@@ -13,7 +13,7 @@ import numpy as np
 
 from appearance_opt.asset import images
 from appearance_opt.asset.encoding import encoded_for
-from appearance_opt.asset.gltf_materials import STRENGTH
+from appearance_opt.asset.gltf_materials import IOR, STRENGTH, TRANSMISSION, VOLUME
 from appearance_opt.asset.height import as_16_bit, height_png
 from appearance_opt.asset.paths import replacing
 
@@ -159,6 +159,8 @@ class _Writer:
             out["occlusionTexture"] = {"index": self._texture(m.orm_texture)}
         if m.emits:
             self._add_emission(out, m)
+        if m.transmission > 0:
+            self._add_transmission(out, m)
         if m.displacement is not None:
             out["extras"] = {"displacement": self._displacement(m.displacement)}
         if m.alpha_mode != "opaque":
@@ -173,8 +175,33 @@ class _Writer:
         if m.emission_texture is not None:
             out["emissiveTexture"] = {"index": self._texture(m.emission_texture, "srgb")}
         if strength > 1:
-            out["extensions"] = {STRENGTH: {"emissiveStrength": strength}}
-            self.json["extensionsUsed"] = [STRENGTH]
+            self._extend(out, STRENGTH, {"emissiveStrength": strength})
+
+    def _add_transmission(self, out: dict[str, Any], m: Material) -> None:
+        through: dict[str, Any] = {"transmissionFactor": m.transmission}
+        if m.transmission_texture is not None:
+            through["transmissionTexture"] = {"index": self._texture(m.transmission_texture)}
+        self._extend(out, TRANSMISSION, through)
+        if m.ior != 1.5:
+            self._extend(out, IOR, {"ior": m.ior})
+        if m.volume is None:
+            return
+        inside: dict[str, Any] = {
+            "thicknessFactor": m.volume.thickness,
+            "attenuationColor": list(m.volume.attenuation_color),
+        }
+        if np.isfinite(m.volume.attenuation_distance):
+            inside["attenuationDistance"] = m.volume.attenuation_distance
+        if m.thickness_texture is not None:
+            inside["thicknessTexture"] = {"index": self._texture(m.thickness_texture)}
+        self._extend(out, VOLUME, inside)
+
+    def _extend(self, out: dict[str, Any], name: str, values: dict[str, Any]) -> None:
+        """Add an extension to a material, and to those that the file uses."""
+        out.setdefault("extensions", {})[name] = values
+        used = self.json.setdefault("extensionsUsed", [])
+        if name not in used:
+            used.append(name)
 
     def _displacement(self, given: Displacement) -> dict[str, Any]:
         d = as_16_bit(given)

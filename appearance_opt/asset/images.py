@@ -43,6 +43,14 @@ def read(path: Path) -> NDArray:
     return decode(read_bytes(path), str(path))
 
 
+def colored(pixels: NDArray) -> NDArray:
+    """Pixels of at least three channels: grey ones repeat theirs, and keep their alpha if they have one."""
+    if pixels.shape[2] >= 3:
+        return pixels
+    grey = np.repeat(pixels[..., :1], 3, axis=2)
+    return grey if pixels.shape[2] == 1 else np.concatenate([grey, pixels[..., 1:]], axis=2)
+
+
 def check_png(data: bytes, name: str) -> None:
     """Raise InputError if a PNG file is cut short or a chunk's checksum is wrong (PNG specification, 5.3).
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from appearance_opt.asset import images, uv_frames
-from appearance_opt.asset.packing import pack_orm
+from appearance_opt.asset.packing import pack_orm, with_alpha
 from appearance_opt.asset.paths import read_text
 from appearance_opt.asset.types import Material, Texture, Wrap
 from appearance_opt.errors import InputError
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from appearance_opt.asset.companions import Companions
-    from appearance_opt.asset.types import ColorSpace
+    from appearance_opt.asset.types import AlphaMode, ColorSpace
 
 _MAP_OPTIONS = {
     "-blendu": 1, "-blendv": 1, "-boost": 1, "-mm": 2, "-o": 3, "-s": 3, "-t": 3, "-texres": 1,
@@ -35,15 +35,17 @@ _OPTIONAL = ("-o", "-s", "-t")
 _NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?")
 
 _NORMAL, _BUMP = ("norm", "map_kn"), ("map_bump", "bump")
-_USED = ("map_kd", "map_pr", "map_pm", "map_ke", "map_ka", *_NORMAL, *_BUMP)
-"""Maps that are read; that of the ambient colour, which lights nothing here, usually repeats the diffuse one."""
-
-_NOT_MAPS = ("map_aat", "map_d")
-"""The first is a switch; the second has a note of its own."""
+_USED = ("map_kd", "map_pr", "map_pm", "map_ke", "map_ka", "map_d", "map_aat", *_NORMAL, *_BUMP)
+"""Maps that are read; that of the ambient colour, which lights nothing here, usually repeats the diffuse one, and
+``map_aat`` is a switch, not a map."""
 
 WITHOUT_MAP, LOST = "# without its map: ", "lost:"
 """Start of the comments in which our own files keep a constant for when its map gets lost, and what stands for it here
 before the constant's key. The maps hold the factors there, and the constants beside them are 1 (see ``obj_write``)."""
+
+ALPHA_TEST, TESTED = "# alpha test: ", "tested"
+"""Start of the comment in which our own files keep the cutoff of a material with the alpha mode "mask", for which the
+format has no word, and its key here."""
 
 UNIT, MOSTLY = 0.1, 0.9
 """A picture is taken for a normal map if at least the share ``MOSTLY`` of its texels, decoded, have a length within
@@ -57,7 +59,7 @@ class _Map:
     file: str
     wrap: Wrap = "repeat"
     strength: float = 1.0
-    channel: int = 0
+    channel: int | None = None
     frame: NDArray[np.float64] = field(default_factory=lambda: uv_frames.affine(None))
     ignored: tuple[str, ...] = ()
 
@@ -78,6 +80,8 @@ class MaterialReader:
         for line in read_text(path).splitlines():
             if line.startswith(WITHOUT_MAP):
                 line = LOST + line[len(WITHOUT_MAP) :]
+            elif line.startswith(ALPHA_TEST):
+                line = f"{TESTED} {line[len(ALPHA_TEST) :]}"
             words = line.split(None, 1)
             if len(words) < 2 or words[0].startswith("#"):
                 continue
@@ -117,6 +121,7 @@ class _Statements:
         lost = glow_map is None and "map_ke" in self.values
         glow = [0.0] * 3 if lost else self._numbers("ke", [float(glow_map is not None)] * 3)
         normal, strength = self._normal()
+        opacity, alpha_map = self._opacity()
         self._note_what_is_dropped()
         return Material(
             name=self.name,
@@ -124,9 +129,12 @@ class _Statements:
             roughness=1.0 if rough_map is not None else min(max(roughness, 0.0), 1.0),
             metalness=1.0 if metal_map is not None else self._numbers("pm", [0.0])[0],
             normal_scale=strength,
-            base_color_texture=base,
+            base_color_texture=base if alpha_map is None else with_alpha(base, alpha_map),
             orm_texture=None if rough_map is None and metal_map is None else pack_orm(rough_map, metal_map),
             normal_texture=normal,
+            opacity=opacity,
+            alpha_mode=self._alpha_mode(opacity < 1 or alpha_map is not None),
+            alpha_cutoff=self._numbers(TESTED, [0.5])[0],
             emission=(glow[0], glow[1], glow[2]),
             emission_texture=glow_map,
         )
@@ -158,23 +166,43 @@ class _Statements:
         if given.ignored:
             self._note(f"{' '.join(given.ignored)} of {key} ignored")
         if slot in self.frames and not np.allclose(self.frames[slot], given.frame):
-            self._note("the maps of roughness and metalness differ in transform: the first one's is used for both")
+            which = "roughness and metalness" if slot == "orm_texture" else "colour and alpha"
+            self._note(f"the maps of {which} differ in transform: the first one's is used for both")
         self.frames.setdefault(slot, given.frame)
         if one_channel:
-            pixels = pixels[..., min(given.channel, pixels.shape[2] - 1)][..., None]
-        elif pixels.shape[2] < 3:
-            pixels = np.repeat(pixels[..., :1], 3, axis=2)
+            channel = given.channel
+            if channel is None:  # what is named as a map of alpha is often a picture with alpha
+                alpha = pixels.shape[2] - 1
+                has_alpha = key == "map_d" and alpha in (1, 3) and pixels[..., alpha].min() < _one(pixels)
+                channel = alpha if has_alpha else 0
+            pixels = pixels[..., min(channel, pixels.shape[2] - 1)][..., None]
+        else:
+            pixels = images.colored(pixels)
         if pixels.dtype.kind == "f":  # EXR and HDR files are linear
             space = "linear"
         return Texture(np.ascontiguousarray(pixels), space, (given.wrap, given.wrap))
 
+    def _opacity(self) -> tuple[float, Texture | None]:
+        """(factor, map) of alpha. The format has no alpha test: our own files keep theirs in a comment."""
+        alpha_map = self._texture("base_color_texture", "map_d", one_channel=True)
+        if alpha_map is not None:
+            return 1.0, alpha_map
+        opacity = 1 - self._numbers("tr", [0.0])[0]
+        if "d" in self.values:
+            opacity = float(self.values["d"].split()[-1])  # it may have the option -halo
+        if opacity <= 0:
+            self._note("says that nothing of it is seen (d 0 or Tr 1), as some exporters do of all: drawn opaque")
+            opacity = 1.0
+        return opacity, None
+
+    def _alpha_mode(self, transparent: bool) -> AlphaMode:
+        if not transparent:
+            return "opaque"
+        return "mask" if TESTED in self.values else "blend"
+
     def _note_what_is_dropped(self) -> None:
-        dissolve = self.values.get("d", "1").split()[-1]  # it may have the option -halo
-        opacity = 1 - self._numbers("tr", [0.0])[0] if "d" not in self.values else float(dissolve)
-        if opacity < 1 or "map_d" in self.values:
-            self._note("transparency ignored, drawn opaque")
         maps = [k for k in self.values if k.startswith("map_") or k in ("disp", "decal", "refl")]
-        dropped = [k for k in maps if k not in (*_USED, *_NOT_MAPS)]
+        dropped = [k for k in maps if k not in _USED]
         if dropped:
             self._note(f"{', '.join(dropped)} ignored")
 
@@ -198,7 +226,7 @@ def _map(statement: str) -> _Map:
         file=rest[1:-1] if len(rest) > 2 and rest[0] == rest[-1] == '"' else rest,
         wrap="clamp" if found.get("-clamp") == ["on"] else "repeat",
         strength=float(found.get("-bm", ["1"])[0]),
-        channel={"g": 1, "b": 2, "m": 3}.get(found.get("-imfchan", ["l"])[0], 0),
+        channel={"r": 0, "g": 1, "b": 2, "m": 3}.get(found.get("-imfchan", ["l"])[0]),
         frame=uv_frames.usd_affine(scale[:2], 0.0, offset[:2]),  # these count v upward, too
         ignored=tuple(ignored),
     )
@@ -225,6 +253,11 @@ def _taken(text: str, option: str) -> tuple[list[str], str]:
 def _numbers(words: list[str], default: float) -> tuple[float, float, float]:
     u, v, w = [*(float(x) for x in words), *(default,) * 3][:3]
     return u, v, w
+
+
+def _one(pixels: NDArray) -> float:
+    """What stands for 1 in pixels."""
+    return np.iinfo(pixels.dtype).max if pixels.dtype.kind == "u" else 1.0
 
 
 def looks_like_normals(texture: Texture) -> bool:

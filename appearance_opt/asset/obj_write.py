@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from appearance_opt.asset import images
+from appearance_opt.asset.alpha import coverage, kind_of
 from appearance_opt.asset.encoding import encoded_for
-from appearance_opt.asset.mtl import WITHOUT_MAP
+from appearance_opt.asset.mtl import ALPHA_TEST, WITHOUT_MAP
 from appearance_opt.asset.paths import file_name, replacing
 from appearance_opt.asset.types import Texture, linear_to_srgb
 
@@ -24,7 +25,8 @@ if TYPE_CHECKING:
 def save_obj(asset: Asset, path: Path) -> None:
     """Write OBJ, MTL (with the PBR extension: Pr, Pm, map_Pr, map_Pm, norm) and PNG textures.
 
-    Vertex colours follow the positions, sRGB encoded, as Blender and MeshLab write and read them.
+    Vertex colours follow the positions, sRGB encoded, as Blender and MeshLab write and read them; the format has no
+    place for their alpha. What light passes through becomes alpha: of ``alpha.coverage``.
     """
     # the number keeps names apart that are equal, or become so
     named = {id(m.material): f"{i}_{_word(m.material.name)}" for i, m in enumerate(asset.meshes)}
@@ -48,7 +50,8 @@ def save_obj(asset: Asset, path: Path) -> None:
 
 
 def _vertices(mesh: Mesh) -> list[str]:
-    colors = np.empty((len(mesh.positions), 0)) if mesh.colors is None else linear_to_srgb(np.clip(mesh.colors, 0, 1))
+    colors = np.empty((len(mesh.positions), 0), np.float32) if mesh.colors is None else mesh.colors[:, :3]
+    colors = linear_to_srgb(np.clip(colors, 0, 1))
     rows = np.concatenate([mesh.positions, colors], axis=1)
     lines = ["v " + " ".join(f"{x:.9g}" for x in row) for row in rows.tolist()]
     if mesh.uvs is not None:
@@ -89,7 +92,8 @@ def _mtl_lines(m: Material, path: Path) -> list[str]:
     lines = [f"newmtl {m.name}", *constant("Kd", m.base_color, m.base_color_texture is not None)]
     lines += [*constant("Pr", (m.roughness,), orm), *constant("Pm", (m.metalness,), orm)]
     if m.base_color_texture is not None:
-        lines.append("map_Kd " + picture("base_color", encoded_for(m.base_color_texture, "srgb", m.base_color)))
+        color = encoded_for(m.base_color_texture, "srgb", m.base_color)
+        lines.append("map_Kd " + picture("base_color", color[..., :3]))
     if orm:
         lines.append("map_Pr " + picture("roughness", plane(1, m.roughness)))
         lines.append("map_Pm " + picture("metalness", plane(2, m.metalness)))
@@ -100,6 +104,12 @@ def _mtl_lines(m: Material, path: Path) -> list[str]:
     if m.normal_texture is not None:
         strength = "" if m.normal_scale == 1 else f"-bm {m.normal_scale:.6g} "
         lines.append(f"norm {strength}" + picture("normal", encoded_for(m.normal_texture, "linear")[..., :3]))
+    factor, alpha = coverage(m)
+    if factor < 1 or alpha is not None:
+        # readers differ in whether d multiplies its map, too
+        mapped = None if alpha is None else picture("alpha", encoded_for(alpha, "linear", (factor,)))
+        lines += [f"d {factor:.6g}"] if mapped is None else ["d 1", f"map_d {mapped}"]
+        lines += [f"{ALPHA_TEST}{m.alpha_cutoff:.6g}"] if kind_of(m) == "mask" else []
     return [*lines, ""]
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -45,6 +47,35 @@ def pack_orm(roughness: Texture | None, metalness: Texture | None) -> Texture:
         if plane is not None:
             out[..., channel] = plane
     return Texture(out, "linear", given[0].wrap)
+
+
+def with_occlusion(orm: Texture | None, occlusion: Texture) -> Texture:
+    """A texture of roughness and metalness (1 without one) with the first channel of another as its occlusion."""
+    return _replaced(_white(occlusion) if orm is None else orm, 0, occlusion)
+
+
+def with_alpha(color: Texture | None, alpha: Texture) -> Texture:
+    """A base colour (white without one) with the first channel of another texture as its alpha."""
+    color = replace(_white(alpha), color_space="srgb") if color is None else color
+    return _replaced(color, 3, alpha)
+
+
+def _white(like: Texture) -> Texture:
+    return Texture(np.full((*like.pixels.shape[:2], 3), 255, np.uint8), "linear", like.wrap)
+
+
+def _replaced(texture: Texture, channel: int, source: Texture) -> Texture:
+    """A texture whose ``channel`` (one more than there are, too) is the first one of another. The smaller of the two is
+    brought to the size of the larger; those of one size and depth keep their texels."""
+    height, width = (max(t.pixels.shape[k] for t in (texture, source)) for k in (0, 1))
+    stored = texture.pixels.dtype == source.pixels.dtype and source.color_space == "linear"
+    if stored and texture.pixels.shape[:2] == source.pixels.shape[:2]:
+        pixels, plane, space = texture.pixels, source.pixels[..., :1], texture.color_space
+    else:
+        pixels, plane = (resized(t.linear(), height, width) for t in (texture, source))
+        plane, space = plane[..., :1], "linear"
+    pixels = np.concatenate([pixels[..., :channel], plane, pixels[..., channel + 1 :]], axis=2)
+    return Texture(np.ascontiguousarray(pixels), space, texture.wrap)
 
 
 def pack_emission(values: NDArray[np.float32]) -> tuple[tuple[float, float, float], Texture | None]:

@@ -65,10 +65,12 @@ def constants(material: Specular) -> tuple[tuple[float, float, float], float, fl
 
 
 def textures(material: Specular) -> tuple[Texture, Texture]:
-    """(base colour, ORM) textures, 8 bits, of a material with at least one texture; they hold its factors, too."""
+    """(base colour, ORM) textures, 8 bits, of a material with at least one texture; they hold its factors, too. The
+    diffuse texture's alpha becomes that of the base colour."""
     given = [t for t in (material.diffuse_texture, material.specular_texture) if t is not None]
     height, width = (max(t.pixels.shape[k] for t in given) for k in (0, 1))
-    base = np.empty((height, width, 3), np.uint8)
+    has_alpha = material.diffuse_texture is not None and material.diffuse_texture.pixels.shape[2] == 4
+    base = np.empty((height, width, 4 if has_alpha else 3), np.uint8)
     orm = np.full((height, width, 3), 255, np.uint8)
     # textures of different sizes are brought to the larger one, each as a whole
     whole = [
@@ -85,7 +87,9 @@ def textures(material: Specular) -> tuple[Texture, Texture]:
             diffuse[..., :3] * np.array(material.diffuse, np.float32),
             specular[..., :3] * np.array(material.specular, np.float32),
         )
-        base[band] = np.round(255 * linear_to_srgb(color))
+        base[band, :, :3] = np.round(255 * linear_to_srgb(color))
+        if has_alpha:
+            base[band, :, 3] = np.round(255 * diffuse[..., 3])
         orm[band, :, 1] = np.round(255 * np.clip(1 - specular[..., 3] * np.float32(material.glossiness), 0, 1))
         orm[band, :, 2] = np.round(255 * metalness)
     return Texture(base, "srgb", given[0].wrap), Texture(orm, "linear", given[0].wrap)

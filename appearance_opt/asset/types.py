@@ -72,14 +72,28 @@ class Displacement:
 
 
 @dataclass(frozen=True)
+class Volume:
+    """What light passes through inside of a transmissive object (glTF 2.0's KHR_materials_volume, whose units are
+    metres): carried over, drawn by no renderer here."""
+
+    thickness: float = 0.0
+    attenuation_distance: float = float("inf")
+    attenuation_color: tuple[float, float, float] = (1.0, 1.0, 1.0)
+
+
+@dataclass(frozen=True)
 class Material:
     """glTF 2.0 metallic-roughness material (what a texture gives is multiplied by its factor).
 
     ``base_color``: linear RGB factor. ``orm_texture``: R occlusion (not used by the renderer; written as
     occlusion if ``has_occlusion``), G roughness, B metalness, as glTF packs them. ``displacement`` is
-    written where a format has it; no renderer here reads it. ``opacity``/``alpha_mode``/``alpha_cutoff``
-    are carried for later use; opaque rendering ignores them. ``emission``: linear RGB factor, may exceed 1, and its
+    written where a format has it; no renderer here reads it. ``emission``: linear RGB factor, may exceed 1, and its
     sRGB texture: carried over, drawn by no renderer here, for it does not depend on any light.
+
+    Alpha is ``opacity`` times the fourth channels of ``base_color_texture`` and of vertex colours. It means nothing
+    with the ``alpha_mode`` "opaque"; with "mask" the surface is there where alpha is at least ``alpha_cutoff``; with
+    "blend" alpha is its coverage. ``transmission``: share of the light that passes through (times the red channel of
+    its texture); ``ior``, ``volume`` and the green channel of ``thickness_texture`` are carried over beside it.
     """
 
     name: str = "material"
@@ -98,6 +112,11 @@ class Material:
     double_sided: bool = True
     emission: tuple[float, float, float] = (0.0, 0.0, 0.0)
     emission_texture: Texture | None = None
+    transmission: float = 0.0
+    transmission_texture: Texture | None = None
+    ior: float = 1.5
+    volume: Volume | None = None
+    thickness_texture: Texture | None = None
 
     @property
     def emits(self) -> bool:
@@ -111,7 +130,7 @@ class Mesh:
 
     ``positions`` (V, 3) float32; ``faces`` (F, 3) int32; ``normals`` (V, 3) unit or None (none in
     the file); ``uvs`` (V, 2) or None; ``tangents`` (V, 4) or None; ``colors`` (V, 3) linear vertex
-    colours or None. Vertices are split at UV and normal seams, as in the file.
+    colours, (V, 4) with alpha, or None. Vertices are split at UV and normal seams, as in the file.
     """
 
     positions: NDArray[np.float32]

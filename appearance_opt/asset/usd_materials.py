@@ -11,7 +11,7 @@ import numpy as np
 
 from appearance_opt.asset import images, specular_glossiness, uv_frames
 from appearance_opt.asset.materialx import load_materialx
-from appearance_opt.asset.packing import pack_orm
+from appearance_opt.asset.packing import pack_orm, with_alpha
 from appearance_opt.asset.paths import check_inside
 from appearance_opt.asset.specular_glossiness import Specular
 from appearance_opt.asset.types import Material, Mesh, Texture
@@ -181,6 +181,14 @@ class MaterialReader:
         # without the texture that says where it glows, nothing does
         emission, strength = self._scaled(glow_map, "srgb", "rgb", (0.0, 0.0, 0.0) if glow_map else _rgb(glow))
         normal, normal_scale = self._normals(normal_map)
+        opacity, alpha, alpha_map, threshold = self._opacity(shader)
+        if alpha is not None:
+            if base is not None and not np.allclose(_frame(color_map), _frame(alpha_map)):
+                self.note(
+                    f"material '{name}': colour and opacity differ in transform: the first one's is used for both"
+                )
+            base, color_map = with_alpha(base, alpha), color_map if base is not None else alpha_map
+        transparent = alpha is not None or opacity < 1
         out = Material(
             name=name,
             base_color=base_factor,
@@ -190,7 +198,9 @@ class MaterialReader:
             base_color_texture=base,
             orm_texture=pack_orm(rough, metal) if rough or metal else None,
             normal_texture=normal,
-            opacity=self._opacity(shader, name),
+            opacity=opacity,
+            alpha_mode=("mask" if threshold > 0 else "blend") if transparent else "opaque",
+            alpha_cutoff=threshold if threshold > 0 else 0.5,
             emission=strength,
             emission_texture=emission,
         )
@@ -207,17 +217,12 @@ class MaterialReader:
         self.frames[id(out)] = {n: _frame(node) for n, node in nodes.items() if node}
         return out
 
-    def _opacity(self, shader: Any, name: str) -> float:
-        """The constant; what drives it beside is noted, for all is drawn opaque."""
-        opacity, node, _ = _input(shader, "opacity", 1.0)
+    def _opacity(self, shader: Any) -> tuple[float, Texture | None, Any, float]:
+        """(factor, texture of one channel or None, its node, threshold) of what a surface covers."""
+        opacity, node, channel = _input(shader, "opacity", 1.0)
         threshold = float(_value(shader.GetInput("opacityThreshold")) or 0.0)
-        if node:
-            cut = f", cut out at {threshold:g}" if threshold > 0 else ""
-            self.note(f"material '{name}': transparency (by a texture{cut}) ignored, drawn opaque")
-            return 1.0
-        if float(opacity) < 1:
-            self.note(f"material '{name}': transparency ignored, drawn opaque")
-        return float(opacity)
+        texture, factor = self._scaled(node, "linear", channel, (float(opacity),) * 3)
+        return factor[0], texture, node, threshold
 
     def in_one_frame(self, meshes: list[Mesh], keep_layout: bool = False) -> list[Mesh]:
         """Texture transforms applied, and textures brought under one transform and wrap mode where they differ; or all
@@ -272,10 +277,12 @@ class MaterialReader:
             space = "srgb"
         elif pixels.dtype != np.uint8 or pixels.shape[2] < 3:
             space = "linear"  # "auto" takes 8-bit colours alone for sRGB
-        if channel in _CHANNEL and channel != "rgb":
-            pixels = pixels[..., min(_CHANNEL[channel], pixels.shape[2] - 1)][..., None]
-        elif pixels.shape[2] < 3:
-            pixels = np.repeat(pixels[..., :1], 3, axis=2)
+        pixels = images.colored(pixels)
+        if channel in _CHANNEL:
+            if channel == "a":  # linear in any picture, and 1 in those without
+                space = "linear"
+                pixels = pixels if pixels.shape[2] == 4 else _opaque(pixels)
+            pixels = pixels[..., _CHANNEL[channel]][..., None]
         wraps = tuple(_WRAPS.get(str(_value(node.GetInput(k))), "repeat") for k in ("wrapS", "wrapT"))
         return Texture(np.ascontiguousarray(pixels), space, wraps)  # type: ignore[arg-type]
 
@@ -301,6 +308,12 @@ def _purpose(binding: Any) -> str:
     if words[:1] == ["collection"]:
         words = words[1:-1]
     return words[0] if words else ""
+
+
+def _opaque(pixels: NDArray) -> NDArray:
+    """Pixels (H, W, 3) with an alpha of 1."""
+    one = np.iinfo(pixels.dtype).max if pixels.dtype.kind == "u" else 1
+    return np.concatenate([pixels, np.full_like(pixels[..., :1], one)], axis=2)
 
 
 def _input(shader: Any, key: str, default: Any) -> tuple[Any, Any, str]:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from appearance_opt.asset import images
+from appearance_opt.asset.alpha import coverage, kind_of
 from appearance_opt.asset.encoding import encoded_for
 from appearance_opt.asset.height import as_16_bit, height_png
 from appearance_opt.asset.paths import MAX_NAME, replacing
@@ -25,7 +26,8 @@ _SPACES: dict[str, ColorSpace] = {"sRGB": "srgb", "raw": "linear"}
 def save_usd(asset: Asset, path: Path) -> None:
     """Write .usd, .usda or .usdc with PNG files in ``<stem>_textures/``, or one .usdz package. Y up,
     metres. Vertex colours, times the base colour, are read by the surface where it has no texture of that; a
-    UsdPreviewSurface cannot multiply the two. Raises OSError when the disk refuses."""
+    UsdPreviewSurface cannot multiply the two. What light passes through becomes opacity: of ``alpha.coverage``.
+    Raises OSError when the disk refuses."""
     from pxr import Sdf, Tf, UsdUtils
 
     path = Path(path)
@@ -103,7 +105,9 @@ def _mesh(stage: Any, target: str, mesh: Mesh, material: Any) -> None:
     if mesh.colors is not None:
         color = api.CreatePrimvar("displayColor", Sdf.ValueTypeNames.Color3fArray, UsdGeom.Tokens.vertex)
         factor = mesh.material.base_color if _colored(mesh) else (1.0, 1.0, 1.0)
-        color.Set(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(mesh.colors * np.array(factor, np.float32), np.float32)))
+        color.Set(
+            Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(mesh.colors[:, :3] * np.array(factor, np.float32), np.float32))
+        )
     UsdShade.MaterialBindingAPI.Apply(out.GetPrim()).Bind(material)
 
 
@@ -120,6 +124,7 @@ def _material(stage: Any, target: str, m: Material, folder: Path, colored: bool)
     if m.emits:
         preview.color("emissiveColor", "emission", m.emission, m.emission_texture)
     preview.roughness_and_metalness(m)
+    preview.opacity(m)
     if m.normal_texture is not None:
         s = m.normal_scale
         node = preview.sampler("normal", m.normal_texture, "raw", (2 * s, 2 * s, 2, 1), (-s, -s, -1, 0))
@@ -211,3 +216,18 @@ class _Preview:
         self.connect("metallic", "Float", node, "b")
         if m.has_occlusion:
             self.connect("occlusion", "Float", node, "r")
+
+    def opacity(self, m: Material) -> None:
+        """Coverage by a constant or a texture, for the alpha test if there is one."""
+        factor, texture = coverage(m)
+        if factor == 1 and texture is None:
+            return
+        if texture is None:
+            self.shader.CreateInput("opacity", self.types.Float).Set(factor)
+        else:
+            pixels = images.encode_png(encoded_for(texture, "linear", (factor,)))
+            self.connect("opacity", "Float", self.sampler("opacity", texture, "raw", data=pixels), "r")
+        if kind_of(m) == "mask":
+            self.shader.CreateInput("opacityThreshold", self.types.Float).Set(m.alpha_cutoff)
+        else:  # its highlights are covered as the rest of it is, as in glTF
+            self.shader.CreateInput("opacityMode", self.types.Token).Set("presence")

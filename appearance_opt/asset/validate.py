@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from appearance_opt.asset.alpha import settled
 from appearance_opt.asset.normals import unit, vertex_normals, weld
 from appearance_opt.asset.types import Asset, Mesh
 from appearance_opt.errors import InputError
@@ -20,7 +21,7 @@ MAX_UV = 65536.0
 """Texture coordinates farther from the unit square than this have no fraction left in single precision that
 could address a texel."""
 
-_WIDTHS = {"positions": 3, "normals": 3, "uvs": 2, "tangents": 4, "colors": 3}
+_WIDTHS = {"positions": (3,), "normals": (3,), "uvs": (2,), "tangents": (4,), "colors": (3, 4)}
 
 
 @dataclass(frozen=True)
@@ -96,7 +97,8 @@ def repair(asset: Asset, source: str) -> Asset:
     """The asset with harmless faults mended, and a note for each kind. ``source`` names it in errors.
 
     Dropped: degenerate faces, unreferenced vertices, empty meshes. Recomputed: normals that are not
-    finite or zero. Clamped: texture coordinates, colours and factors beyond their range. Raises InputError
+    finite or zero. Clamped: texture coordinates, colours and factors beyond their range. Opaque: what only speaks
+    of transparency (``alpha.settled``). Raises InputError
     for positions, texture coordinates or factors that are not finite, attributes that do not fit the
     positions, indices out of range, and when no face is left.
     """
@@ -108,7 +110,7 @@ def repair(asset: Asset, source: str) -> Asset:
     materials = {id(m.material): m.material for m in meshes}
     mended = {key: repair_material(m, source, notes) for key, m in materials.items()}
     meshes = [replace(m, material=mended[id(m.material)]) for m in meshes]
-    return replace(asset, meshes=tuple(meshes), notes=asset.notes + tuple(notes))
+    return settled(replace(asset, meshes=tuple(meshes), notes=asset.notes + tuple(notes)))
 
 
 def _repair(mesh: Mesh, source: str, notes: list[str]) -> Mesh:
@@ -118,9 +120,9 @@ def _repair(mesh: Mesh, source: str, notes: list[str]) -> Mesh:
             f"{source}, mesh '{mesh.name}': {bad} faces refer to vertices that do not exist "
             f"(there are {len(mesh.positions)}); export it again"
         )
-    for name, width in _WIDTHS.items():
+    for name, widths in _WIDTHS.items():
         values = getattr(mesh, name)
-        if values is not None and values.shape != (len(mesh.positions), width):
+        if values is not None and values.shape not in [(len(mesh.positions), width) for width in widths]:
             raise InputError(
                 f"{source}, mesh '{mesh.name}': its {name} are {values.shape} numbers for {len(mesh.positions)} "
                 "positions; export it again"
@@ -158,8 +160,8 @@ def _repair_ranges(mesh: Mesh, notes: list[str]) -> Mesh:
 def repair_material(material: Material, source: str, notes: list[str]) -> Material:
     """The material with factors and float texels within [0, 1], and a note if they were not. Raises
     InputError for factors that are not numbers."""
-    factors = (*material.base_color, material.roughness, material.metalness)
-    others = (material.normal_scale, *material.emission, material.opacity, material.alpha_cutoff)
+    factors = (*material.base_color, material.roughness, material.metalness, material.opacity, material.transmission)
+    others = (material.normal_scale, *material.emission, material.alpha_cutoff, material.ior)
     if not np.isfinite((*factors, *others)).all():
         raise InputError(
             f"{source}, material '{material.name}': a factor is NaN or infinite; set it to a number from 0 to 1"
@@ -170,9 +172,10 @@ def repair_material(material: Material, source: str, notes: list[str]) -> Materi
         material = replace(material, emission=(red, green, blue))
     if min(factors) < 0 or max(factors) > 1:
         notes.append(f"material '{material.name}': factors outside of 0 to 1 clamped")
-        r, g, b, roughness, metalness = (min(max(f, 0.0), 1.0) for f in factors)
+        r, g, b, roughness, metalness, opacity, through = (min(max(f, 0.0), 1.0) for f in factors)
         material = replace(material, base_color=(r, g, b), roughness=roughness, metalness=metalness)
-    for name in ("base_color_texture", "orm_texture", "normal_texture"):
+        material = replace(material, opacity=opacity, transmission=through)
+    for name in ("base_color_texture", "orm_texture", "normal_texture", "transmission_texture", "thickness_texture"):
         texture = getattr(material, name)
         if texture is None or texture.pixels.dtype.kind != "f":
             continue

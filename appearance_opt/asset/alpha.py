@@ -1,0 +1,169 @@
+"""Which parts of an asset can be seen through.
+
+Exporters write MASK and BLEND far more often than they mean it: what counts is the alpha that a mesh really shows.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Literal, get_args
+
+import numpy as np
+
+from appearance_opt.asset.packing import resized
+from appearance_opt.asset.types import Texture
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from numpy.typing import NDArray
+
+    from appearance_opt.asset.types import Asset, Material, Mesh
+
+Kind = Literal["opaque", "mask", "blend", "transmission"]
+KINDS: tuple[Kind, ...] = get_args(Kind)
+
+OPAQUE = 1 - 1.5 / 255
+"""Alpha from which on nothing is seen through: one step of eight bits below 1."""
+
+
+NAMED = 5
+"""Names that a note lists before it counts."""
+
+
+def kind_of(material: Material) -> Kind:
+    """How a material is seen through, by its own words (see ``settled`` for materials that do not mean them)."""
+    if material.transmission > 0:
+        return "transmission"
+    return material.alpha_mode
+
+
+def seen_through(mesh: Mesh) -> bool:
+    """Is there anything of a mesh that light passes?"""
+    return kind_of(mesh.material) != "opaque"
+
+
+def coverage(material: Material) -> tuple[float, Texture | None]:
+    """(factor, linear texture of one channel or None): the share of the light behind it that a material keeps back,
+    for formats and renderers that know no transmission. It is alpha times 1 - t (1 - F), where t is the transmission
+    and F the reflectance at normal incidence; glTF 2.0, B.3.1: F = ((ior - 1) / (ior + 1))^2."""
+    m = material
+    alpha, factor = None, 1.0
+    if m.alpha_mode != "opaque":
+        factor, color = m.opacity, m.base_color_texture
+        if color is not None and color.pixels.shape[2] == 4:
+            alpha = Texture(color.pixels[..., 3:], "linear", color.wrap)
+    if m.transmission <= 0:
+        return factor, alpha
+    if m.alpha_mode == "mask":  # what passes the test lets light through: no test is left
+        values = np.ones((1, 1, 1), np.float32) if alpha is None else alpha.linear()
+        test = (values * np.float32(factor) >= m.alpha_cutoff).astype(np.float32)
+        alpha, factor = Texture(test, "linear", ("repeat",) * 2 if alpha is None else alpha.wrap), 1.0
+    passing = m.transmission * (1 - ((m.ior - 1) / (m.ior + 1)) ** 2)
+    through = m.transmission_texture
+    if through is None:
+        return factor * (1 - passing), alpha
+    kept = 1 - np.float32(passing) * through.linear()[..., :1]
+    if alpha is None:
+        return factor, Texture(kept, "linear", through.wrap)
+    height, width = (max(t.pixels.shape[k] for t in (alpha, through)) for k in (0, 1))
+    values = resized(alpha.linear(), height, width) * resized(kept, height, width)
+    return factor, Texture(values, "linear", alpha.wrap)
+
+
+def counted(asset: Asset) -> dict[Kind, tuple[int, int]]:
+    """(meshes, triangles) of each kind that an asset has."""
+    found = [(kind_of(m.material), len(m.faces)) for m in asset.meshes]
+    return {k: (len(n), sum(n)) for k in KINDS if (n := [count for kind, count in found if kind == k])}
+
+
+def settled(asset: Asset) -> Asset:
+    """The asset with meshes opaque whose materials speak of transparency, but whose alpha is opaque wherever they lie
+    in their textures; a note names these materials. Costs nothing without such materials."""
+    if not any(map(seen_through, asset.meshes)):
+        return asset
+    tests = _Tests()
+    new: dict[int, Material] = {}
+    meshes = []
+    for mesh in asset.meshes:
+        if seen_through(mesh) and tests.opaque(mesh):
+            given = mesh.material
+            if id(given) not in new:
+                new[id(given)] = replace(given, alpha_mode="opaque", opacity=1.0, transmission=0.0)
+            mesh = replace(mesh, material=new[id(given)], colors=None if mesh.colors is None else mesh.colors[:, :3])
+        meshes.append(mesh)
+    if not new:
+        return asset
+    names = listed(m.name for m in new.values())
+    note = f"materials that speak of transparency are opaque wherever they are used, and count as that: {names}"
+    return replace(asset, meshes=tuple(meshes), notes=(*asset.notes, note))
+
+
+def listed(names: Iterable[str]) -> str:
+    """Names for a note, the first ``NAMED`` of them."""
+    known = list(dict.fromkeys(names))
+    more = f" and {len(known) - NAMED} more" if len(known) > NAMED else ""
+    return ", ".join(f"'{n}'" for n in known[:NAMED]) + more
+
+
+@dataclass
+class _Tests:
+    """Looks each texture up once."""
+
+    _sums: dict[tuple[int, float], NDArray[np.int64] | None] = field(default_factory=dict)
+
+    def opaque(self, mesh: Mesh) -> bool:
+        """Is a mesh opaque on all of its faces?"""
+        m = mesh.material
+        if m.transmission > 0:  # a texture that takes it all back is not worth a search
+            return m.transmission_texture is not None and not m.transmission_texture.pixels[..., 0].any()
+        needed = m.alpha_cutoff if m.alpha_mode == "mask" else OPAQUE
+        least = m.opacity
+        if mesh.colors is not None and mesh.colors.shape[1] == 4:
+            least *= float(mesh.colors[:, 3].min(initial=1.0))
+        if needed <= 0:
+            return True
+        if least < needed:
+            return False
+        texture = m.base_color_texture
+        if texture is None or texture.pixels.shape[2] < 4:
+            return True
+        sums = self._below(texture, needed / least)
+        return sums is None or bool((_counts(sums, mesh, texture) == 0).all())
+
+    def _below(self, texture: Texture, needed: float) -> NDArray[np.int64] | None:
+        """(H + 1, W + 1) numbers of texels with less alpha than ``needed`` above and left of each corner of the grid;
+        None if there are none at all."""
+        key = id(texture), needed
+        if key not in self._sums:
+            alpha = texture.pixels[..., 3]
+            top = np.iinfo(alpha.dtype).max if alpha.dtype.kind == "u" else 1
+            below = alpha < np.float32(needed * top)
+            sums = None
+            if below.any():
+                sums = np.zeros((below.shape[0] + 1, below.shape[1] + 1), np.int64)
+                sums[1:, 1:] = below.cumsum(axis=0).cumsum(axis=1)
+            self._sums[key] = sums
+        return self._sums[key]
+
+
+def _counts(sums: NDArray[np.int64], mesh: Mesh, texture: Texture) -> NDArray[np.int64]:
+    """(F,) marked texels in the boxes around the faces, of those that bilinear lookups reach. ``sums``: see
+    ``_Tests._below``. A face that crosses the border of the image, where it repeats, counts all of it."""
+    size = np.array(sums.shape[::-1]) - 1
+    if mesh.uvs is None:
+        return np.full(len(mesh.faces), sums[-1, -1])
+    corners = mesh.uvs.astype(np.float64)[mesh.faces]
+    low, high = corners.min(axis=1), corners.max(axis=1)
+    for axis in (0, 1):
+        if texture.wrap[axis] == "repeat":  # into the period in which the box begins
+            period = np.floor(low[:, axis])
+            low[:, axis] -= period
+            high[:, axis] -= period
+    first, last = np.floor(low * size - 0.5), np.floor(high * size - 0.5) + 1
+    clamped = np.array([w == "clamp" for w in texture.wrap])
+    whole = (((first < 0) | (last >= size)) & ~clamped).any(axis=1)
+    x0, y0 = np.clip(first, 0, size - 1).astype(np.int64).T
+    x1, y1 = np.clip(last, 0, size - 1).astype(np.int64).T + 1
+    inside = sums[y1, x1] - sums[y0, x1] - sums[y1, x0] + sums[y0, x0]
+    return np.where(whole, sums[-1, -1], inside)
