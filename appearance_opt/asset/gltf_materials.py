@@ -55,22 +55,27 @@ class MaterialReader:
                 return mapping["material"]
         return primitive.get("material")
 
-    def read(self, index: int | None) -> tuple[Material, list[int]]:
-        """(material, numbers of the sets of texture coordinates that its textures read)."""
+    def read(self, index: int | None) -> tuple[Material, int]:
+        """(material, index of the texture coordinates that its textures use)."""
+        infos = self._texture_infos(index)
+        channels = [
+            i.get("extensions", {}).get("KHR_texture_transform", {}).get("texCoord", i.get("texCoord", 0))
+            for i in infos.values()
+        ]
+        if len(set(channels)) > 1:
+            self.note("textures of one material use different texture coordinates: the first set is used for all")
         if index not in self._materials:
             self._materials[index] = Material() if index is None else self._read_material(index)
-        sets = [_coordinates(i) for i in self._texture_infos(index).values()]
-        return self._materials[index], list(dict.fromkeys(sets)) or [0]
+        return self._materials[index], channels[0] if channels else 0
 
     def in_one_frame(self, meshes: list[Mesh], keep_layout: bool = False) -> list[Mesh]:
-        """KHR_texture_transform applied, and textures brought under one set of coordinates, one transform and one wrap
-        mode where they differ; or all as it is (``keep_layout``: see ``asset.load``)."""
+        """KHR_texture_transform applied, and textures brought under one transform and wrap mode where they differ;
+        or all as it is (``keep_layout``: see ``asset.load``)."""
         frames_of = {}
         for index, material in self._materials.items():
-            sets = self.read(index)[1]
+            extensions = {n: info.get("extensions", {}) for n, info in self._texture_infos(index).items()}
             frames_of[id(material)] = {
-                n: uv_frames.Frame(uv_frames.affine(_transform(info)), sets.index(_coordinates(info)))
-                for n, info in self._texture_infos(index).items()
+                n: uv_frames.affine(e.get("KHR_texture_transform")) for n, e in extensions.items()
             }
         place = uv_frames.kept if keep_layout else uv_frames.unified
         return place(meshes, frames_of, self.note)
@@ -228,19 +233,11 @@ class MaterialReader:
         return images.decode(data, f"{self.path}, image {image.get('name') or index} of material '{material}'")
 
 
-def _transform(info: dict[str, Any]) -> dict[str, Any] | None:
-    return info.get("extensions", {}).get("KHR_texture_transform")
-
-
-def _coordinates(info: dict[str, Any]) -> int:
-    """Number of the set of texture coordinates that a texture reads."""
-    return (_transform(info) or {}).get("texCoord", info.get("texCoord", 0))
-
-
 def _quoted(names: list[str]) -> str:
     return ", ".join(f"'{n}'" for n in names)
 
 
 def _place(info: dict[str, Any]) -> tuple[int, str]:
     """Which texture coordinates a texture uses, and where it lies in them."""
-    return _coordinates(info), str(sorted((_transform(info) or {}).items()))
+    transform = info.get("extensions", {}).get("KHR_texture_transform", {})
+    return transform.get("texCoord", info.get("texCoord", 0)), str(sorted(transform.items()))

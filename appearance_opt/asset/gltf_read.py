@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from appearance_opt.asset import uv_frames
 from appearance_opt.asset.gltf_accessors import Document
 from appearance_opt.asset.gltf_draco import DRACO, Compressed
 from appearance_opt.asset.gltf_materials import READ_EXTENSIONS, MaterialReader
@@ -135,13 +134,12 @@ class _Reader:
         if "NORMAL" in attributes:
             normals = read("NORMAL").astype(np.float64)
             tangents = read("TANGENT").astype(np.float64) if "TANGENT" in attributes else None
-        material, sets = self.materials.read(self.materials.of(primitive))
+        material, channel = self.materials.read(self.materials.of(primitive))
         if "COLOR_0" in attributes:
             colors = read("COLOR_0").astype(np.float32)
             if material.alpha_mode == "opaque":  # their alpha means nothing
                 colors = colors[:, :3]
-        names = [f"TEXCOORD_{k}" for k in sets]
-        uvs = uv_frames.stacked([_float(read(n)[:, :2]) if n in attributes else None for n in names])
+        uvs = _float(read(f"TEXCOORD_{channel}")) if f"TEXCOORD_{channel}" in attributes else None
         if "skin" in node and "JOINTS_0" in attributes:
             places = [self.nodes.skinned(node["skin"], attributes, read)]
         else:

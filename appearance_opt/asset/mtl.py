@@ -71,7 +71,7 @@ class MaterialReader:
     def __init__(self, companions: Companions) -> None:
         self.companions, self.note = companions, companions.note
         self.by_name: dict[str, Material] = {}
-        self.frames: dict[int, dict[str, uv_frames.Frame]] = {}
+        self.frames: dict[int, dict[str, NDArray[np.float64]]] = {}
 
     def read(self, path: Path) -> None:
         """Add the materials of a file. Raises InputError."""
@@ -104,7 +104,7 @@ class _Statements:
 
     def __init__(self, name: str, values: dict[str, str], path: Path, companions: Companions) -> None:
         self.name, self.values, self.path, self.companions = name, values, path, companions
-        self.frames: dict[str, uv_frames.Frame] = {}
+        self.frames: dict[str, NDArray[np.float64]] = {}
 
     def material(self) -> Material:
         """Phong exponents become roughness sqrt(2 / (Ns + 2)). Constants beside a map are ignored, for many exporters
@@ -165,10 +165,10 @@ class _Statements:
             return None
         if given.ignored:
             self._note(f"{' '.join(given.ignored)} of {key} ignored")
-        if slot in self.frames and not np.allclose(self.frames[slot].matrix, given.frame):
+        if slot in self.frames and not np.allclose(self.frames[slot], given.frame):
             which = "roughness and metalness" if slot == "orm_texture" else "colour and alpha"
             self._note(f"the maps of {which} differ in transform: the first one's is used for both")
-        self.frames.setdefault(slot, uv_frames.Frame(given.frame))
+        self.frames.setdefault(slot, given.frame)
         if one_channel:
             channel = given.channel
             if channel is None:  # what is named as a map of alpha is often a picture with alpha

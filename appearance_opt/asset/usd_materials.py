@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,7 +18,7 @@ from appearance_opt.asset.types import Material, Mesh, Texture
 from appearance_opt.errors import MissingFileError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Iterator
 
     from numpy.typing import NDArray
 
@@ -27,8 +27,6 @@ if TYPE_CHECKING:
 _WRAPS = {"repeat": "repeat", "clamp": "clamp", "mirror": "mirror", "black": "clamp"}
 _PURPOSES = ("full", "preview", "")
 """Purposes of bindings in the order in which they are taken; the last is that for all."""
-MAX_TRANSFORMS = 16
-"""Transforms in a row before a texture's coordinates: networks may have cycles."""
 _CHANNEL = {"r": 0, "g": 1, "b": 2, "a": 3}
 
 
@@ -38,14 +36,13 @@ class MaterialReader:
     def __init__(self, stage: Any, path: Path, companions: Companions) -> None:
         self.stage, self.path, self.companions, self.note = stage, path, companions, companions.note
         self._materials: dict[str, Material] = {}
-        self.frames: dict[int, dict[str, uv_frames.Frame]] = {}
-        self._sets: dict[int, tuple[str, ...]] = {}  # by id of a material, the primvars that its textures read
+        self.frames: dict[int, dict[str, NDArray[np.float64]]] = {}
         self._pixels: dict[str, NDArray] = {}
         self._by_side: dict[tuple[int, bool], Material] = {}
 
-    def bindings(self, prim: Any, face_ids: NDArray) -> Iterator[tuple[Material, list[str], NDArray[np.bool_]]]:
-        """(material, primvars of the texture coordinates that it reads, mask of the triangles that wear it);
-        ``face_ids``: face of the file of each triangle."""
+    def bindings(self, prim: Any, face_ids: NDArray) -> Iterator[tuple[Material, str, NDArray[np.bool_]]]:
+        """(material, primvar of its texture coordinates, mask of the triangles that wear it); ``face_ids``: face of the
+        file of each triangle."""
         from pxr import UsdGeom
 
         double = bool(UsdGeom.Gprim(prim).GetDoubleSidedAttr().Get())
@@ -54,16 +51,16 @@ class MaterialReader:
             faces = np.array(UsdGeom.Subset(subset).GetIndicesAttr().Get() or [], np.int64)
             mask = np.isin(face_ids, faces) & rest
             rest &= ~mask
-            yield self._sided(self._bound(subset), double), self._uv_names(prim, subset), mask
+            yield self._sided(self._bound(subset), double), self._uv_name(prim, subset), mask
         if rest.any():
-            yield self._sided(self._bound(prim), double), self._uv_names(prim, prim), rest
+            yield self._sided(self._bound(prim), double), self._uv_name(prim, prim), rest
 
     def uv_names(self, prim: Any) -> list[str]:
-        """The primvars that hold texture coordinates of a mesh, of which each of its materials reads some."""
+        """The primvars that hold texture coordinates of a mesh, of which each of its materials reads one."""
         subsets = self._subsets(prim)
         wearers = [*subsets, *([prim] if not subsets or self._bound_prim(prim) else [])]
-        names = list(dict.fromkeys(name for w in wearers for name in self._uv_names(prim, w)))
-        if len(names) > 1 and len(wearers) > 1:
+        names = list(dict.fromkeys(self._uv_name(prim, w) for w in wearers))
+        if len(names) > 1:
             self.note(f"'{prim.GetPath()}': its materials read texture coordinates of their own ({', '.join(names)})")
         return names
 
@@ -72,15 +69,23 @@ class MaterialReader:
 
         return [s.GetPrim() for s in UsdShade.MaterialBindingAPI(prim).GetMaterialBindSubsets()]
 
-    def _uv_names(self, prim: Any, wearer: Any) -> list[str]:
-        """The primvars that the material of ``wearer``, a mesh or a subset of it, reads, in the order of its sets; the
-        usual one for each that the mesh does not have."""
-        from pxr import UsdGeom
+    def _uv_name(self, prim: Any, wearer: Any) -> str:
+        """What the material of ``wearer``, a mesh or a subset of it, reads, or the usual names."""
+        from pxr import UsdGeom, UsdShade
 
+        names = []
+        material = self._bound_prim(wearer)
+        if material:
+            for node in _descendants(material.GetPrim()):
+                shader = UsdShade.Shader(node)
+                if shader and str(shader.GetIdAttr().Get() or "").startswith("UsdPrimvarReader_float2"):
+                    names.append(str(_value(shader.GetInput("varname")) or ""))
         api = UsdGeom.PrimvarsAPI(prim)
-        usual = next((n for n in ("st", "UVMap", "map1", "uv") if api.HasPrimvar(n)), "st")
-        read = self._sets.get(id(self._bound(wearer)), ())
-        return [n if api.HasPrimvar(n) else usual for n in read] or [usual]
+        read = [n for n in dict.fromkeys(names) if n and api.HasPrimvar(n)]
+        if len(read) > 1:
+            told = "use different texture coordinates: the first set is used for all"
+            self.note(f"material '{material.GetPrim().GetName()}': its textures {told}")
+        return next((n for n in (*read, "st", "UVMap", "map1", "uv") if api.HasPrimvar(n)), "st")
 
     def uses_display_color(self, prim: Any) -> bool:
         """Is displayColor what colours the mesh? (No material, or one that reads it.)"""
@@ -178,7 +183,7 @@ class MaterialReader:
         normal, normal_scale = self._normals(normal_map)
         opacity, alpha, alpha_map, threshold = self._opacity(shader)
         if alpha is not None:
-            if base is not None and not _place(color_map).equals(_place(alpha_map)):
+            if base is not None and not np.allclose(_frame(color_map), _frame(alpha_map)):
                 self.note(
                     f"material '{name}': colour and opacity differ in transform: the first one's is used for both"
                 )
@@ -199,25 +204,18 @@ class MaterialReader:
             emission=strength,
             emission_texture=emission,
         )
+        if rough and metal and not np.allclose(_frame(rough_map), _frame(metal_map)):
+            self.note(
+                f"material '{name}': roughness and metalness differ in transform: the first one's is used for both"
+            )
         nodes = {
             "base_color_texture": color_map,
             "orm_texture": rough_map if rough else metal_map,
             "normal_texture": normal_map,
             "emission_texture": glow_map,
         }
-        places = {n: _place(node) for n, node in nodes.items() if node}
-        if rough and metal and not places["orm_texture"].equals(_place(metal_map)):
-            self.note(
-                f"material '{name}': roughness and metalness differ in transform: the first one's is used for both"
-            )
-        self._keep(out, places)
+        self.frames[id(out)] = {n: _frame(node) for n, node in nodes.items() if node}
         return out
-
-    def _keep(self, material: Material, places: Mapping[str, Place]) -> None:
-        """Remember where the textures of a material read."""
-        sets = tuple(dict.fromkeys(p.primvar for p in places.values()))
-        self._sets[id(material)] = sets
-        self.frames[id(material)] = {n: uv_frames.Frame(p.matrix, sets.index(p.primvar)) for n, p in places.items()}
 
     def _opacity(self, shader: Any) -> tuple[float, Texture | None, Any, float]:
         """(factor, texture of one channel or None, its node, threshold) of what a surface covers."""
@@ -355,44 +353,22 @@ def _vector(node: Any, key: str, default: float) -> Any:
     return (default,) * 4 if value is None else tuple(float(x) for x in value)
 
 
-@dataclass(frozen=True)
-class Place:
-    """Where a texture reads: at ``matrix`` (2, 3) times the coordinates ``primvar``."""
-
-    primvar: str = "st"
-    matrix: NDArray[np.float64] = field(default_factory=lambda: uv_frames.affine(None))
-
-    def equals(self, other: Place) -> bool:
-        return self.primvar == other.primvar and np.allclose(self.matrix, other.matrix)
-
-
-def _place(node: Any) -> Place:
-    """Where a sampler reads, after the transforms before it."""
+def _frame(node: Any) -> NDArray[np.float64]:
+    """(2, 3) transform from the mesh's texture coordinates to those at which a sampler reads."""
     from pxr import UsdShade
 
-    matrix = uv_frames.affine(None)
     source = node.GetInput("st")
-    for _ in range(MAX_TRANSFORMS):
-        if not source:
-            break
-        attributes = UsdShade.Utils.GetValueProducingAttributes(source)
-        if not attributes:
-            break
-        before = UsdShade.Shader(attributes[0].GetPrim())
-        kind = str(before.GetIdAttr().Get() or "") if before else ""
-        if kind.startswith("UsdPrimvarReader_float2"):
-            return Place(str(_value(before.GetInput("varname")) or "st"), matrix)
-        if kind != "UsdTransform2d":
-            break
-        scale, rotation, move = (_value(before.GetInput(k)) for k in ("scale", "rotation", "translation"))
-        first = uv_frames.usd_affine(
-            (1.0, 1.0) if scale is None else tuple(scale),
-            0.0 if rotation is None else float(rotation),
-            (0.0, 0.0) if move is None else tuple(move),
-        )
-        matrix = uv_frames.composed(matrix, first)
-        source = before.GetInput("in")
-    return Place(matrix=matrix)
+    attributes = UsdShade.Utils.GetValueProducingAttributes(source) if source else []
+    if attributes:
+        transform = UsdShade.Shader(attributes[0].GetPrim())
+        if transform and str(transform.GetIdAttr().Get()) == "UsdTransform2d":
+            scale, rotation, move = (_value(transform.GetInput(k)) for k in ("scale", "rotation", "translation"))
+            return uv_frames.usd_affine(
+                (1.0, 1.0) if scale is None else tuple(scale),
+                0.0 if rotation is None else float(rotation),
+                (0.0, 0.0) if move is None else tuple(move),
+            )
+    return uv_frames.affine(None)
 
 
 def _rgb(value: Any) -> tuple[float, float, float]:

@@ -148,7 +148,8 @@ class _Decimated:
     def weighted(self, weight: NDArray) -> Start:
         """The reference decimated with these importances of its faces (F,)."""
         merged, visible = self.reference.merged, self.visible
-        positions, faces = decimate(merged.positions, merged.faces[visible], self.triangles, weight[visible])
+        single = self.reference.single[visible]
+        positions, faces = decimate(merged.positions, merged.faces[visible], self.triangles, weight[visible], single)
         if not len(faces):
             raise InputError("nothing is left of this mesh at that budget; ask for more triangles")
         return self._mapped(charted(positions, faces), np.ones(len(faces)), False)

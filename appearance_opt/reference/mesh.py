@@ -11,6 +11,7 @@ import numpy as np
 
 from appearance_opt.asset.normals import split_where_cancelled, summed_normals
 from appearance_opt.asset.packing import EMISSION
+from appearance_opt.asset.sides import single_sided
 from appearance_opt.asset.tangents import any_tangent, split_and_tangents
 from appearance_opt.reference.textures import emission_maps, material_maps
 from appearance_opt.render import deferred, upload
@@ -48,8 +49,9 @@ class MergedMesh:
 class MeshReference:
     """Renders an asset. Also answers what its surface looks like at given points (for the transfer).
 
-    ``merged``: the host arrays; ``scene``: for tracing rays; ``surface``, ``maps``: device data; ``emission``: what
-    the materials emit, which is not rendered; None if they do not.
+    ``merged``: the host arrays; ``single`` (F,): faces that are seen from their front only; ``scene``: for tracing
+    rays; ``surface``, ``maps``: device data; ``emission``: what the materials emit, which is not rendered; None if
+    they do not.
     """
 
     def __init__(self, asset: Asset) -> None:
@@ -59,6 +61,7 @@ class MeshReference:
         self.emission = emission_maps([by_id[k] for k in materials])
         self.merged = merge(asset, [materials.index(id(m.material)) for m in asset.meshes], self.maps.has_normal_map)
         m = self.merged
+        self.single = single_sided(asset.meshes)
         self.scene = upload.scene_of(m.positions, m.faces)
         if m.tangents is None:
             frames = upload.packets(2, m.uvs)
