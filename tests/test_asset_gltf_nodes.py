@@ -214,7 +214,8 @@ def test_instances(tmp_path: Path) -> None:
     )  # fmt: skip
     write_glb(tmp_path / "x.glb", given, binary)
     asset = load(tmp_path / "x.glb")
-    first, second = (m.positions[m.faces[0]] for m in asset.meshes)
+    (mesh,) = asset.meshes  # one holds all places
+    first, second = mesh.positions[mesh.faces]
     np.testing.assert_allclose(first, [[1, 0, 7], [2, 0, 7], [1, 1, 7]], atol=1e-6)
     np.testing.assert_allclose(second, [[0, 5, 7], [-3, 5, 7], [0, 2, 7]], atol=1e-6)
     assert not any("EXT_mesh_gpu_instancing" in n for n in asset.notes)

@@ -249,7 +249,8 @@ def test_values_beyond_their_range_are_clamped_with_a_note(ball: Asset) -> None:
     assert got.material is out.meshes[1].material  # shared before, shared after
     assert got.material.base_color_texture.pixels.min() >= 0 and got.material.base_color_texture.pixels.max() <= 1
     assert np.abs(got.uvs).max() <= MAX_UV and got.colors.min() >= 0
-    assert sum("clamped" in n for n in out.notes) == 6  # uvs and colours of two meshes, factors and texels of one
+    assert sum("clamped" in n for n in out.notes) == 4  # uvs and colours of both meshes, factors and texels
+    assert sum(n.startswith("meshes 'ball', 'twin': ") and "clamped" in n for n in out.notes) == 2
 
 
 def test_attributes_that_do_not_fit_the_positions_are_refused(ball: Asset) -> None:

@@ -7,6 +7,7 @@ from pathlib import Path, PureWindowsPath
 from typing import TYPE_CHECKING, Literal, TypeVar, get_args
 from urllib.parse import unquote
 
+from appearance_opt.asset.notes import Notes
 from appearance_opt.asset.paths import resolve
 from appearance_opt.errors import InputError, MissingFileError
 
@@ -28,13 +29,12 @@ class Companions:
 
     policy: MissingTextures = "error"
     root: Path | None = None
-    notes: list[str] = field(default_factory=list)
+    notes: Notes = field(default_factory=Notes)
     files: list[Path] = field(default_factory=list)
 
-    def note(self, text: str) -> None:
-        """Say something to the user, once."""
-        if text not in self.notes:
-            self.notes.append(text)
+    def note(self, text: str, kind: str | None = None) -> None:
+        """Say something to the user, once; see ``Notes``."""
+        self.notes(text, kind)
 
     def find(self, reference: str, owner: Path, percent_encoded: bool = False) -> Path:
         """Path of a file that ``owner`` refers to; see ``_find``."""
@@ -81,5 +81,5 @@ class Companions:
         except MissingFileError as error:
             if self.policy == "error":
                 raise InputError(f"{error}; add the file, or go on without it: --missing-textures ignore") from None
-            self.note(f"{error}: ignored, {instead}")
+            self.note(f"{error}: ignored, {instead}", f"files ignored, {instead}")
             return None

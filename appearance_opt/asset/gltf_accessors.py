@@ -46,7 +46,8 @@ class Document:
                 f"{path}: glTF version {self.json['asset'].get('version')} is not supported; convert to 2.0"
             )
         self._buffers: dict[int, bytes] = {}
-        self._decompressed: dict[int, bytes] = {}
+        self._decompressed: dict[int, bytes | memoryview] = {}
+        self._accessors: dict[int, NDArray] = {}
 
     def items(self, kind: str) -> list[dict[str, Any]]:
         """A top-level array of the JSON, empty when absent."""
@@ -65,8 +66,8 @@ class Document:
                 raise InputError(f"{self.path}: a data URI is damaged") from None
         return read_bytes(self.companions.find(uri, self.path, percent_encoded=True))
 
-    def buffer_view(self, index: int) -> tuple[bytes, int]:
-        """(bytes, stride or 0) of a buffer view."""
+    def buffer_view(self, index: int) -> tuple[bytes | memoryview, int]:
+        """(bytes, stride or 0) of a buffer view. It shares its memory with the buffer."""
         view = self.items("bufferViews")[index]
         packed = gltf_meshopt.compressed(view)
         if packed is None:
@@ -76,7 +77,13 @@ class Document:
         return self._decompressed[index], view.get("byteStride", 0)
 
     def accessor(self, index: int) -> NDArray:
-        """(count, width) array: floats for float and normalized types, integers otherwise."""
+        """(count, width) array, not to be written to: floats for float and normalized types, integers otherwise. Each
+        is read once."""
+        if index not in self._accessors:
+            self._accessors[index] = self._read_accessor(index)
+        return self._accessors[index]
+
+    def _read_accessor(self, index: int) -> NDArray:
         a = self.items("accessors")[index]
         kind, width, count = np.dtype(COMPONENTS[a["componentType"]]), WIDTHS[a["type"]], a["count"]
         if "bufferView" in a:
@@ -112,17 +119,17 @@ class Document:
             raise InputError(f"{self.path}: an accessor reaches beyond its buffer view; the file is cut short")
         return np.ndarray((count, width), kind.newbyteorder("<"), data, offset, (stride, kind.itemsize))
 
-    def _slice(self, extent: dict[str, Any], index: int) -> bytes:
+    def _slice(self, extent: dict[str, Any], index: int) -> memoryview:
         data = self._buffer(extent["buffer"])
         start, length = extent.get("byteOffset", 0), extent["byteLength"]
         if start < 0 or length < 0 or start + length > len(data):
             raise InputError(f"{self.path}: buffer view {index} reaches beyond its buffer; the file is cut short")
-        return data[start : start + length]
+        return memoryview(data)[start : start + length]
 
-    def _decompress(self, view: dict[str, Any], packed: dict[str, Any], index: int) -> bytes:
+    def _decompress(self, view: dict[str, Any], packed: dict[str, Any], index: int) -> bytes | memoryview:
         """A view's plain bytes; those of its fallback buffer if the package is missing and there is one."""
         try:
-            return gltf_meshopt.decompress(self._slice(packed, index), packed, str(self.path))
+            return gltf_meshopt.decompress(bytes(self._slice(packed, index)), packed, str(self.path))
         except gltf_meshopt.PackageMissing:
             if "uri" not in self.items("buffers")[view["buffer"]]:
                 raise

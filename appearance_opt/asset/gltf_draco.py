@@ -43,7 +43,7 @@ class Compressed:
                 f"{document.path}: Draco compression needs the package DracoPy: pip install 'appearance-opt[draco]' "
                 "(or save the file uncompressed)"
             ) from None
-        data, _ = document.buffer_view(extension["bufferView"])
+        data = bytes(document.buffer_view(extension["bufferView"])[0])
         try:
             mesh = DracoPy.decode(data)
             faces = np.asarray(mesh.faces, np.int64).reshape(-1, 3)

@@ -34,7 +34,7 @@ class MaterialReader:
         self.document, self.path = document, document.path
         self.note = document.companions.note
         self._images: dict[int, NDArray | None] = {}
-        self._materials: dict[int | None, Material] = {}
+        self._materials: dict[int | None, tuple[Material, int]] = {}
         self._variant = self._number(variant)
 
     def _number(self, variant: str | None) -> int | None:
@@ -57,22 +57,23 @@ class MaterialReader:
 
     def read(self, index: int | None) -> tuple[Material, int]:
         """(material, index of the texture coordinates that its textures use)."""
-        infos = self._texture_infos(index)
-        channels = [
-            i.get("extensions", {}).get("KHR_texture_transform", {}).get("texCoord", i.get("texCoord", 0))
-            for i in infos.values()
-        ]
-        if len(set(channels)) > 1:
-            self.note("textures of one material use different texture coordinates: the first set is used for all")
         if index not in self._materials:
-            self._materials[index] = Material() if index is None else self._read_material(index)
-        return self._materials[index], channels[0] if channels else 0
+            infos = self._texture_infos(index)
+            channels = [
+                i.get("extensions", {}).get("KHR_texture_transform", {}).get("texCoord", i.get("texCoord", 0))
+                for i in infos.values()
+            ]
+            if len(set(channels)) > 1:
+                self.note("textures of one material use different texture coordinates: the first set is used for all")
+            material = Material() if index is None else self._read_material(index)
+            self._materials[index] = material, channels[0] if channels else 0
+        return self._materials[index]
 
     def in_one_frame(self, meshes: list[Mesh], keep_layout: bool = False) -> list[Mesh]:
         """KHR_texture_transform applied, and textures brought under one transform and wrap mode where they differ;
         or all as it is (``keep_layout``: see ``asset.load``)."""
         frames_of = {}
-        for index, material in self._materials.items():
+        for index, (material, _) in self._materials.items():
             extensions = {n: info.get("extensions", {}) for n, info in self._texture_infos(index).items()}
             frames_of[id(material)] = {
                 n: uv_frames.affine(e.get("KHR_texture_transform")) for n, e in extensions.items()
@@ -227,7 +228,7 @@ class MaterialReader:
     def _image(self, index: int, material: str) -> NDArray:
         image = self.document.items("images")[index]
         if "bufferView" in image:
-            data = self.document.buffer_view(image["bufferView"])[0]
+            data = bytes(self.document.buffer_view(image["bufferView"])[0])
         else:
             data = self.document.uri(image["uri"])
         return images.decode(data, f"{self.path}, image {image.get('name') or index} of material '{material}'")

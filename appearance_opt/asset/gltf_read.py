@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from appearance_opt.asset.batch import Batch
 from appearance_opt.asset.gltf_accessors import Document
 from appearance_opt.asset.gltf_draco import DRACO, Compressed
 from appearance_opt.asset.gltf_materials import READ_EXTENSIONS, MaterialReader
 from appearance_opt.asset.gltf_meshopt import MESHOPT
-from appearance_opt.asset.gltf_nodes import INSTANCING, Nodes, Placement, local_transform
+from appearance_opt.asset.gltf_nodes import INSTANCING, Nodes, Placement
 from appearance_opt.asset.normals import unit
 from appearance_opt.asset.types import Asset, Mesh
 from appearance_opt.errors import InputError
@@ -44,6 +45,10 @@ class _Reader:
         self.note = document.companions.note
         self.materials = MaterialReader(document, variant)
         self.nodes = Nodes(document)
+        primitives = [p for mesh in document.items("meshes") for p in mesh.get("primitives", [])]
+        self._sharers = Counter(p.get("attributes", {}).get("POSITION") for p in primitives)
+        self._uses = Counter(node["mesh"] for node in document.items("nodes") if "mesh" in node)
+        self._local: dict[tuple[int, int, tuple[float, ...]], Mesh] = {}
 
     def asset(self) -> Asset:
         self._check_extensions()
@@ -56,8 +61,10 @@ class _Reader:
         ):
             if self.document.items(kind):
                 self.note(what)
+        if not self.keep_layout:
+            meshes = self._flat_where_needed(meshes)
         meshes = self.materials.in_one_frame(meshes, self.keep_layout)
-        return Asset(tuple(meshes), self.path.stem, tuple(self.document.companions.notes))
+        return Asset(tuple(meshes), self.path.stem, self.document.companions.notes.lines())
 
     def _roots(self) -> list[int]:
         """The nodes at the top of what is drawn: those of the scene that the file names, else of the
@@ -90,46 +97,49 @@ class _Reader:
         if index in seen:
             raise InputError(f"{self.path}: node {index} is its own ancestor")
         node = self.document.items("nodes")[index]
-        world = parent @ local_transform(node)
+        world = parent @ self.nodes.local[index]
         if "mesh" in node:
             mesh = self.document.items("meshes")[node["mesh"]]
             name = node.get("name") or mesh.get("name") or f"mesh{node['mesh']}"
             for k, primitive in enumerate(mesh["primitives"]):
                 weights = node.get("weights", mesh.get("weights", ()))
-                meshes += self._primitive(primitive, node, world, name if k == 0 else f"{name}.{k}", weights)
+                placed = self._primitive(primitive, k, node, world, name if k == 0 else f"{name}.{k}", weights)
+                meshes += [] if placed is None else [placed]
         for child in node.get("children", []):
             self._visit(child, world, meshes, seen | {index})
 
     def _primitive(
-        self, primitive: dict[str, Any], node: dict[str, Any], world: NDArray, name: str, weights: Sequence[float]
-    ) -> list[Mesh]:
-        """The meshes of a primitive, one for each place at which its node puts it. ``weights``: of
-        its morph targets."""
-        mode = primitive.get("mode", 4)
-        if mode not in (4, 5, 6):
+        self,
+        primitive: dict[str, Any],
+        k: int,
+        node: dict[str, Any],
+        world: NDArray,
+        name: str,
+        weights: Sequence[float],
+    ) -> Mesh | None:
+        """The ``k``-th primitive of a node's mesh, at every place at which the node puts it; None if it is none of
+        triangles. ``weights``: of its morph targets."""
+        if primitive.get("mode", 4) not in (4, 5, 6):
             self.note("points and lines ignored")
-            return []
-        attributes = primitive["attributes"]
-        compressed = Compressed.of(self.document, primitive)
-        # (weight, accessors) of the morph targets that count
-        targets = [(w, t) for w, t in zip(weights, primitive.get("targets", ()), strict=False) if w]
+            return None
         if primitive.get("targets"):
             self.note("morph targets: the shape of their default weights is kept, others are dropped")
+        if "skin" in node and "JOINTS_0" in primitive["attributes"]:
+            source = _Source(self.document, primitive, weights)
+            place = self.nodes.skinned(node["skin"], primitive["attributes"], source.read)
+            return _placed(self._read(primitive, source), place, name)
+        key = (node["mesh"], k, tuple(weights))
+        local = self._local.get(key)
+        if local is None:
+            shared = self._sharers[primitive["attributes"]["POSITION"]] > 1
+            local = self._read(primitive, _Source(self.document, primitive, weights, shared))
+            if self._uses[node["mesh"]] > 1:
+                self._local[key] = local
+        return _placed(local, self.nodes.placement(node, world), name)
 
-        def read(name: str) -> NDArray:
-            if compressed is not None and name in compressed:
-                given = compressed.attribute(name)
-            else:
-                given = self.document.accessor(attributes[name])
-            return self._morphed(given, [(w, t[name]) for w, t in targets if name in t])
-
-        positions = read("POSITION")[:, :3].astype(np.float64)
-        if compressed is not None:
-            faces = compressed.faces
-        else:
-            accessor = primitive.get("indices")
-            indices = np.arange(len(positions)) if accessor is None else self.document.accessor(accessor)[:, 0]
-            faces = _triangles(indices.astype(np.int64), mode)
+    def _read(self, primitive: dict[str, Any], source: _Source) -> Mesh:
+        """A primitive in its own frame, in double precision."""
+        attributes, read = primitive["attributes"], source.read
         normals = tangents = colors = None
         if "NORMAL" in attributes:
             normals = read("NORMAL").astype(np.float64)
@@ -140,16 +150,54 @@ class _Reader:
             if material.alpha_mode == "opaque":  # their alpha means nothing
                 colors = colors[:, :3]
         uvs = _float(read(f"TEXCOORD_{channel}")) if f"TEXCOORD_{channel}" in attributes else None
-        if "skin" in node and "JOINTS_0" in attributes:
-            places = [self.nodes.skinned(node["skin"], attributes, read)]
+        positions = read("POSITION")[:, :3].astype(np.float64)
+        return Mesh(positions, source.faces, normals, uvs, tangents, colors, material)  # type: ignore[arg-type]
+
+    def _flat_where_needed(self, meshes: list[Mesh]) -> list[Mesh]:
+        """The meshes with flat normals where they have none, all in one go."""
+        lacking = [k for k, m in enumerate(meshes) if m.normals is None and _in_range(m)]
+        if not lacking:
+            return meshes
+        self.note("meshes without normals are shaded flat, as glTF 2.0 asks")
+        batch = Batch([meshes[k] for k in lacking])
+        index, faces, normals = flat_normals(batch.joined("positions"), batch.faces)
+        out = list(meshes)
+        for k, mesh in zip(lacking, batch.reindexed(index, faces, normals=normals, tangents=None), strict=True):
+            out[k] = mesh
+        return out
+
+
+class _Source:
+    """The triangles of a primitive, ``faces`` (F, 3), and its attributes. Of accessors that it has ``shared`` with
+    other primitives it takes the vertices that it uses. ``weights``: of its morph targets."""
+
+    def __init__(
+        self, document: Document, primitive: dict[str, Any], weights: Sequence[float], shared: bool = False
+    ) -> None:
+        self.document, self.path, self.attributes = document, document.path, primitive["attributes"]
+        # (weight, accessors) of the morph targets that count
+        self.targets = [(w, t) for w, t in zip(weights, primitive.get("targets", ()), strict=False) if w]
+        self.compressed = Compressed.of(document, primitive)
+        self._used: NDArray | None = None
+        if self.compressed is not None:
+            self.faces = self.compressed.faces
+            return
+        accessor, count = primitive.get("indices"), len(document.accessor(self.attributes["POSITION"]))
+        indices = np.arange(count) if accessor is None else document.accessor(accessor)[:, 0]
+        self.faces = _triangles(indices.astype(np.int64), primitive.get("mode", 4))
+        if shared and len(self.faces) and self.faces.max() < count:
+            used, corners = np.unique(self.faces, return_inverse=True)
+            if len(used) < count:
+                self._used, self.faces = used, corners.reshape(-1, 3)
+
+    def read(self, name: str) -> NDArray:
+        """(V, width) values of an attribute."""
+        if self.compressed is not None and name in self.compressed:
+            values = self.compressed.attribute(name)
         else:
-            places = self.nodes.placements(node, world)
-        local = Mesh(positions, faces, normals, uvs, tangents, colors, material, name)  # type: ignore[arg-type]
-        meshes = [_placed(local, place) for place in places]
-        if normals is None and not self.keep_layout:
-            self.note("meshes without normals are shaded flat, as glTF 2.0 asks")
-            meshes = [_flat(m) for m in meshes]
-        return meshes
+            values = self.document.accessor(self.attributes[name])
+        values = self._morphed(values, [(w, t[name]) for w, t in self.targets if name in t])
+        return values if self._used is None else values[self._used]
 
     def _morphed(self, values: NDArray, displacements: list[tuple[float, int]]) -> NDArray:
         """(V, width) values of an attribute plus the sum of weight * displacement, accessors of which
@@ -167,56 +215,52 @@ class _Reader:
         return out
 
 
-def _placed(mesh: Mesh, place: Placement) -> Mesh:
-    """A mesh, still in double precision, at its place in the world."""
-    faces, mirrors = mesh.faces, place.mirrors(len(mesh.positions))
-    if mirrors.any():
-        turned = mirrors[faces[:, 0]][:, None]
-        faces = np.where(turned, faces[:, ::-1], faces)
+def _placed(mesh: Mesh, place: Placement, name: str) -> Mesh:
+    """A mesh, still in double precision, at all its places in the world."""
+    vertices = len(mesh.positions)
     normals, tangents = mesh.normals, mesh.tangents
     if normals is not None:
         normals = _float(_normalized(place.normals(normals)))
     if tangents is not None:
         # a reflection turns cross(normal, tangent) over, but not the bitangent
-        w = np.where((tangents[:, 3:4] < 0) != mirrors[:, None], -1, 1)
+        negative = place.repeated(tangents[:, 3:4] < 0)
+        w = np.where(negative != place.mirrored(vertices)[:, None], -1, 1)
         tangents = _float(np.concatenate([_normalized(place.directions(tangents[:, :3])), w], axis=1))
-    return replace(
-        mesh,
+    return Mesh(
         positions=place.points(mesh.positions).astype(np.float32),
-        faces=np.ascontiguousarray(faces, np.int32),
+        faces=place.faces(mesh.faces, vertices),
         normals=normals,
+        uvs=place.repeated(mesh.uvs),
         tangents=tangents,
+        colors=place.repeated(mesh.colors),
+        material=mesh.material,
+        name=name,
     )
 
 
-def _flat(mesh: Mesh) -> Mesh:
-    """The mesh with its faces' normals: "When normals are not specified, client implementations MUST calculate flat
-    normals and the provided tangents (if present) MUST be ignored" (glTF 2.0, 3.7.2.1). Where faces of different
-    normals meet, each corner gets a vertex of its own."""
-    corners = mesh.faces.ravel()
-    if len(corners) and (corners.min() < 0 or corners.max() >= len(mesh.positions)):
-        return mesh  # refused by ``repair``, which counts them
-    p = mesh.positions[mesh.faces].astype(np.float64)
+def _in_range(mesh: Mesh) -> bool:
+    """Do all its corners exist? (If not, ``repair`` refuses it, and counts them.)"""
+    return not len(mesh.faces) or (mesh.faces.min() >= 0 and mesh.faces.max() < len(mesh.positions))
+
+
+def flat_normals(positions: NDArray, faces: NDArray) -> tuple[NDArray[np.intp], NDArray[np.int64], NDArray[np.float32]]:
+    """(vertex that each new vertex comes from, faces, normals) with the faces' normals: "When normals are not
+    specified, client implementations MUST calculate flat normals and the provided tangents (if present) MUST be
+    ignored" (glTF 2.0, 3.7.2.1). Where faces of different normals meet, each corner gets a vertex of its own."""
+    corners = faces.ravel()
+    p = positions[faces].astype(np.float64)
     with np.errstate(all="ignore"):
         normal = unit(np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0])).astype(np.float32)
     normal = np.repeat(normal, 3, axis=0)
-    some = np.zeros((len(mesh.positions), 3), np.float32)  # the normal of some face of each vertex
+    some = np.zeros((len(positions), 3), np.float32)  # the normal of some face of each vertex
     some[corners] = normal
     disagree = (some[corners] != normal).any(axis=1)
     shared = np.bincount(corners[disagree], minlength=len(some)) == 0
     split = ~shared[corners]
     index = np.concatenate([np.flatnonzero(shared), corners[split]])
-    faces = (np.cumsum(shared) - 1)[corners]
-    faces[split] = int(shared.sum()) + np.arange(int(split.sum()))
-    return replace(
-        mesh,
-        positions=mesh.positions[index],
-        faces=faces.reshape(-1, 3).astype(np.int32),
-        normals=np.concatenate([some[shared], normal[split]]),
-        uvs=None if mesh.uvs is None else mesh.uvs[index],
-        colors=None if mesh.colors is None else mesh.colors[index],
-        tangents=None,
-    )
+    new = (np.cumsum(shared) - 1)[corners]
+    new[split] = int(shared.sum()) + np.arange(int(split.sum()))
+    return index, new.reshape(-1, 3), np.concatenate([some[shared], normal[split]])
 
 
 def _triangles(indices: NDArray, mode: int) -> NDArray:

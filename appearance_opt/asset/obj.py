@@ -116,7 +116,7 @@ class _Parser:
         ]
         place = uv_frames.kept if keep_layout else uv_frames.unified
         meshes = place(meshes, self.materials.frames, self.companions.note)
-        return Asset(tuple(meshes), self.path.stem, tuple(self.companions.notes))
+        return Asset(tuple(meshes), self.path.stem, self.companions.notes.lines())
 
     def _mesh(self, name: str, has_uv: bool, has_normal: bool, polygons: list[list[tuple[int, int, int]]]) -> Mesh:
         indices = np.array([c for p in polygons for c in p], np.int64)

@@ -135,7 +135,7 @@ class _Reader:
                 if geometry is not None:
                     meshes += self._split(prim, geometry, self._to_world(prim))
         meshes = self.materials.in_one_frame(meshes, keep_layout)
-        return Asset(tuple(meshes), self.path.stem, tuple(self.companions.notes))
+        return Asset(tuple(meshes), self.path.stem, self.companions.notes.lines())
 
     def _to_world(self, prim: Any) -> Any:
         """From a mesh's own frame to the world. A skinned one is kept at its bind pose, where its own transform does

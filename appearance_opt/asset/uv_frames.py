@@ -55,10 +55,14 @@ def unified(
     where they differ. ``frames_of``: by ``id`` of a material, the transform (2, 3) of each of its textures by field
     name; materials that are not there stay. ``note``: told what was resampled."""
     out = list(meshes)
-    for material in {id(m.material): m.material for m in meshes}.values():
+    wearers: dict[int, list[int]] = {}
+    for k, m in enumerate(meshes):
+        if m.uvs is not None:
+            wearers.setdefault(id(m.material), []).append(k)
+    for own in wearers.values():
+        material = meshes[own[0]].material
         frames = {n: f for n, f in frames_of.get(id(material), {}).items() if getattr(material, n) is not None}
-        own = [k for k, m in enumerate(meshes) if m.material is material and m.uvs is not None]
-        if not own or not frames:
+        if not frames:
             continue
         textures = {n: getattr(material, n) for n in frames}
         uvs = [np.asarray(meshes[k].uvs) for k in own]

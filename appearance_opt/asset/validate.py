@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from appearance_opt.asset.alpha import settled
+from appearance_opt.asset.batch import WIDTHS, Batch
 from appearance_opt.asset.normals import unit, vertex_normals, weld
+from appearance_opt.asset.notes import Notes
 from appearance_opt.asset.types import Asset, Mesh
 from appearance_opt.errors import InputError
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from numpy.typing import NDArray
 
     from appearance_opt.asset.types import Material
@@ -21,12 +25,13 @@ MAX_UV = 65536.0
 """Texture coordinates farther from the unit square than this have no fraction left in single precision that
 could address a texel."""
 
-_WIDTHS = {"positions": (3,), "normals": (3,), "uvs": (2,), "tangents": (4,), "colors": (3, 4)}
+LIMITS: dict[str, tuple[float, float]] = {"uvs": (-MAX_UV, MAX_UV), "colors": (0.0, 1.0)}
+"""Least and greatest values of attributes that mean something."""
 
 
 @dataclass(frozen=True)
 class Validation:
-    """Counts over all meshes of an asset. Edges and parts are counted on welded positions."""
+    """Counts over all meshes of an asset. Edges and parts are counted on the welded positions of each mesh."""
 
     triangles: int = 0
     non_finite_positions: int = 0
@@ -39,13 +44,11 @@ class Validation:
     non_manifold_edges: int = 0
     connected_parts: int = 0
 
-    def __add__(self, other: Validation) -> Validation:
-        return Validation(**{f.name: getattr(self, f.name) + getattr(other, f.name) for f in fields(self)})
-
 
 def inspected(asset: Asset, path: str) -> tuple[Validation, Asset]:
     """(counts, the asset after ``repair``): of what that mends as it is in the file, of all else as it is left."""
-    found, mended = validate(asset), repair(asset, path)
+    mended = repair(asset, path)
+    found = validate(asset)
     counted = {name: getattr(found, name) for name in _MENDED}
     return replace(validate(mended), **counted), mended
 
@@ -55,42 +58,46 @@ _MENDED = ("non_finite_positions", "indices_out_of_range", "degenerate_faces", "
 
 def validate(asset: Asset) -> Validation:
     """Count what is wrong. Changes nothing."""
-    total = Validation()
-    for mesh in asset.meshes:
-        total += _validate(mesh)
-    return total
-
-
-def _validate(mesh: Mesh) -> Validation:
-    bad_index = (mesh.faces < 0) | (mesh.faces >= len(mesh.positions))
-    finite = np.isfinite(mesh.positions).all(axis=1)
-    faces = mesh.faces[~bad_index.any(axis=1)]
-    basic = Validation(
-        triangles=len(mesh.faces),
-        non_finite_positions=int((~finite).sum()),
+    batch = Batch(asset.meshes)
+    positions = batch.joined("positions")
+    bad_index = (batch.own_faces < 0) | (batch.own_faces >= batch.vertex_counts[batch.mesh_of_face][:, None])
+    faces = batch.faces[~bad_index.any(axis=1)]
+    used = np.zeros(len(positions), bool)
+    used[faces] = True
+    # vertices of different meshes stay apart
+    first, place = weld(np.concatenate([positions, batch.mesh_of_vertex[:, None].astype(positions.dtype)], axis=1))
+    welded = place[faces]
+    edges, uses = _counted(np.sort(welded[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1), len(first))
+    return Validation(
+        triangles=len(batch.own_faces),
+        non_finite_positions=int((~np.isfinite(positions).all(axis=1)).sum()),
         indices_out_of_range=int(bad_index.sum()),
-        degenerate_faces=int(_degenerate(mesh.positions, faces).sum()),
-        unreferenced_vertices=len(mesh.positions) - len(np.unique(faces)),
-        meshes_without_uvs=int(mesh.uvs is None),
+        degenerate_faces=int(_degenerate(positions, faces).sum()),
+        duplicate_faces=len(welded) - len(np.unique(np.sort(welded, axis=1), axis=0)),
+        unreferenced_vertices=int((~used).sum()),
+        meshes_without_uvs=int((~batch.have("uvs")).sum()),
+        boundary_edges=int((uses == 1).sum()),
+        non_manifold_edges=int((uses > 2).sum()),
+        connected_parts=_parts(edges, welded, len(first)),
     )
-    if not len(faces):
-        return basic
+
+
+def _counted(edges: NDArray, vertices: int) -> tuple[NDArray, NDArray]:
+    """(edges (E, 2) between two vertices, each once; how often each is there)."""
+    edges = edges[edges[:, 0] != edges[:, 1]]
+    keys, uses = np.unique(edges[:, 0] * vertices + edges[:, 1], return_counts=True)
+    return np.stack(np.divmod(keys, max(vertices, 1)), axis=1), uses
+
+
+def _parts(edges: NDArray, faces: NDArray, vertices: int) -> int:
+    """How many connected parts the faces make."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
-    first, place = weld(mesh.positions)
-    welded = place[faces]
-    edges = np.sort(np.concatenate([welded[:, [0, 1]], welded[:, [1, 2]], welded[:, [2, 0]]]), axis=1)
-    edges, uses = np.unique(edges[edges[:, 0] != edges[:, 1]], axis=0, return_counts=True)
-    n = len(first)
-    graph = coo_matrix((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), (n, n))
-    labels = connected_components(graph, directed=False)[1]
-    return basic + Validation(
-        duplicate_faces=len(welded) - len(np.unique(np.sort(welded, axis=1), axis=0)),
-        boundary_edges=int((uses == 1).sum()),
-        non_manifold_edges=int((uses > 2).sum()),
-        connected_parts=len(np.unique(labels[np.unique(welded)])),
-    )
+    if not len(faces):
+        return 0
+    graph = coo_matrix((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), (vertices, vertices))
+    return len(np.unique(connected_components(graph, directed=False)[1][faces]))
 
 
 def repair(asset: Asset, source: str) -> Asset:
@@ -102,25 +109,62 @@ def repair(asset: Asset, source: str) -> Asset:
     for positions, texture coordinates or factors that are not finite, attributes that do not fit the
     positions, indices out of range, and when no face is left.
     """
-    notes: list[str] = []
-    meshes = [m for m in (_repair(mesh, source, notes) for mesh in asset.meshes) if len(m.faces)]
+    notes = Notes()
+    found = zip(asset.meshes, _suspects(asset.meshes), strict=True)
+    meshes = [_repair(mesh, source, notes) if suspect else mesh for mesh, suspect in found]
+    meshes = [m for m in meshes if len(m.faces)]
     if not meshes:
         raise InputError(f"{source}: there are no triangles in it")
     # meshes that shared a material go on sharing it
     materials = {id(m.material): m.material for m in meshes}
     mended = {key: repair_material(m, source, notes) for key, m in materials.items()}
-    meshes = [replace(m, material=mended[id(m.material)]) for m in meshes]
-    return settled(replace(asset, meshes=tuple(meshes), notes=asset.notes + tuple(notes)))
+    new = [mended[id(m.material)] for m in meshes]
+    meshes = [m if m.material is n else replace(m, material=n) for m, n in zip(meshes, new, strict=True)]
+    return settled(replace(asset, meshes=tuple(meshes), notes=asset.notes + notes.lines()))
 
 
-def _repair(mesh: Mesh, source: str, notes: list[str]) -> Mesh:
+def _suspects(meshes: Sequence[Mesh]) -> NDArray[np.bool_]:
+    """(M,) which meshes may have a fault that ``_repair`` looks for? Asked of all at once: most have none."""
+    unfit = np.array([_misshapen(m) for m in meshes], bool)
+    fit = np.flatnonzero(~unfit)
+    batch = Batch([meshes[k] for k in fit.tolist()])
+    out_of_range = (batch.own_faces < 0) | (batch.own_faces >= batch.vertex_counts[batch.mesh_of_face][:, None])
+    unfit[fit[batch.mesh_of_face[out_of_range.any(axis=1)]]] = True
+    fit = np.flatnonzero(~unfit)
+    batch = Batch([meshes[k] for k in fit.tolist()])
+    positions = batch.joined("positions")
+    used = np.zeros(len(positions), bool)
+    used[batch.faces] = True
+    wrong = ~used | ~np.isfinite(positions).all(axis=1)
+    for name, (low, high) in LIMITS.items():
+        values = batch.joined(name)
+        wrong |= ~((values >= low) & (values <= high)).all(axis=1)
+    lengths = {"normals": np.linalg.norm(batch.joined("normals"), axis=1)}
+    lengths["tangents"] = np.linalg.norm(batch.joined("tangents")[:, :3], axis=1)
+    for name, length in lengths.items():
+        close = np.abs(length - 1) <= 1e-3 if name == "normals" else (length >= 1e-6) & np.isfinite(length)
+        wrong |= ~close & batch.have(name)[batch.mesh_of_vertex]
+    unfit[fit[batch.mesh_of_vertex[wrong]]] = True
+    unfit[fit[batch.mesh_of_face[_degenerate(positions, batch.faces)]]] = True
+    return unfit
+
+
+def _misshapen(mesh: Mesh) -> bool:
+    """Has a mesh attributes that do not fit its positions, or tangents without normals?"""
+    count = len(mesh.positions)
+    given = ((getattr(mesh, name), widths) for name, widths in WIDTHS.items())
+    fits = all(v is None or (v.ndim == 2 and len(v) == count and v.shape[1] in widths) for v, widths in given)
+    return not fits or (mesh.tangents is not None and mesh.normals is None)
+
+
+def _repair(mesh: Mesh, source: str, notes: Notes) -> Mesh:
     bad = int(((mesh.faces < 0) | (mesh.faces >= len(mesh.positions))).any(axis=1).sum())
     if bad:
         raise InputError(
             f"{source}, mesh '{mesh.name}': {bad} faces refer to vertices that do not exist "
             f"(there are {len(mesh.positions)}); export it again"
         )
-    for name, widths in _WIDTHS.items():
+    for name, widths in WIDTHS.items():
         values = getattr(mesh, name)
         if values is not None and values.shape not in [(len(mesh.positions), width) for width in widths]:
             raise InputError(
@@ -137,27 +181,26 @@ def _repair(mesh: Mesh, source: str, notes: list[str]) -> Mesh:
             raise InputError(f"{source}, mesh '{mesh.name}': its {name} have NaN or infinite values; export it again")
     degenerate = _degenerate(mesh.positions, mesh.faces)
     if degenerate.any():
-        notes.append(f"mesh '{mesh.name}': {int(degenerate.sum())} degenerate faces dropped")
+        notes(f"mesh '{mesh.name}': {int(degenerate.sum())} degenerate faces dropped")
         mesh = replace(mesh, faces=mesh.faces[~degenerate])
         used = np.unique(mesh.faces)
     if len(used) < len(mesh.positions):
-        notes.append(f"mesh '{mesh.name}': {len(mesh.positions) - len(used)} unreferenced vertices dropped")
+        notes(f"mesh '{mesh.name}': {len(mesh.positions) - len(used)} unreferenced vertices dropped")
         mesh = _compacted(mesh, used)
     return _repair_normals(_repair_ranges(mesh, notes), notes)
 
 
-def _repair_ranges(mesh: Mesh, notes: list[str]) -> Mesh:
+def _repair_ranges(mesh: Mesh, notes: Notes) -> Mesh:
     """Texture coordinates and colours brought to where they mean something."""
-    limits: dict[str, tuple[float, float]] = {"uvs": (-MAX_UV, MAX_UV), "colors": (0.0, 1.0)}
-    for name, (low, high) in limits.items():
+    for name, (low, high) in LIMITS.items():
         values = getattr(mesh, name)
         if values is not None and len(values) and (values.min() < low or values.max() > high):
-            notes.append(f"mesh '{mesh.name}': {name} outside of {low:g} to {high:g} clamped")
+            notes(f"mesh '{mesh.name}': {name} outside of {low:g} to {high:g} clamped")
             mesh = replace(mesh, **{name: np.clip(values, low, high)})
     return mesh
 
 
-def repair_material(material: Material, source: str, notes: list[str]) -> Material:
+def repair_material(material: Material, source: str, notes: Notes) -> Material:
     """The material with factors and float texels within [0, 1], and a note if they were not. Raises
     InputError for factors that are not numbers."""
     factors = (*material.base_color, material.roughness, material.metalness, material.opacity, material.transmission)
@@ -167,11 +210,11 @@ def repair_material(material: Material, source: str, notes: list[str]) -> Materi
             f"{source}, material '{material.name}': a factor is NaN or infinite; set it to a number from 0 to 1"
         )
     if min(material.emission) < 0:
-        notes.append(f"material '{material.name}': negative emission set to 0")
+        notes(f"material '{material.name}': negative emission set to 0")
         red, green, blue = (max(x, 0.0) for x in material.emission)
         material = replace(material, emission=(red, green, blue))
     if min(factors) < 0 or max(factors) > 1:
-        notes.append(f"material '{material.name}': factors outside of 0 to 1 clamped")
+        notes(f"material '{material.name}': factors outside of 0 to 1 clamped")
         r, g, b, roughness, metalness, opacity, through = (min(max(f, 0.0), 1.0) for f in factors)
         material = replace(material, base_color=(r, g, b), roughness=roughness, metalness=metalness)
         material = replace(material, opacity=opacity, transmission=through)
@@ -180,18 +223,18 @@ def repair_material(material: Material, source: str, notes: list[str]) -> Materi
         if texture is None or texture.pixels.dtype.kind != "f":
             continue
         if texture.pixels.min() < 0 or texture.pixels.max() > 1:
-            notes.append(f"material '{material.name}': values of its {name} outside of 0 to 1 clamped")
+            notes(f"material '{material.name}': values of its {name} outside of 0 to 1 clamped")
             material = replace(material, **{name: replace(texture, pixels=np.clip(texture.pixels, 0, 1))})
     return material
 
 
-def _repair_normals(mesh: Mesh, notes: list[str]) -> Mesh:
+def _repair_normals(mesh: Mesh, notes: Notes) -> Mesh:
     if mesh.normals is None:
         return replace(mesh, tangents=None)
     length = np.linalg.norm(mesh.normals, axis=1)
     bad = ~np.isfinite(length) | (length < 1e-6)
     if bad.any():
-        notes.append(f"mesh '{mesh.name}': {int(bad.sum())} normals recomputed")
+        notes(f"mesh '{mesh.name}': {int(bad.sum())} normals recomputed")
         normals = np.where(bad[:, None], vertex_normals(mesh.positions, mesh.faces), mesh.normals)
         mesh = replace(mesh, normals=normals.astype(np.float32))
     if mesh.normals is not None and np.abs(length[~bad] - 1).max(initial=0) > 1e-3:
@@ -199,7 +242,7 @@ def _repair_normals(mesh: Mesh, notes: list[str]) -> Mesh:
     if mesh.tangents is not None:
         size = np.linalg.norm(mesh.tangents[:, :3], axis=1)
         if not np.isfinite(size).all() or (size < 1e-6).any():
-            notes.append(f"mesh '{mesh.name}': unusable tangents recomputed")
+            notes(f"mesh '{mesh.name}': unusable tangents recomputed")
             mesh = replace(mesh, tangents=None)
     return mesh
 

@@ -1,0 +1,189 @@
+"""What a file of many parts costs: what is shared is read and mended once, what is alike is noted once. Counted in
+calls and lines, not in seconds."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import fields, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from appearance_opt.asset import load, uv_frames, validate
+from appearance_opt.asset.gltf_accessors import Document
+from appearance_opt.asset.gltf_read import _Reader
+from appearance_opt.asset.notes import LINES, Notes
+from appearance_opt.asset.types import Asset, Material, Mesh
+from appearance_opt.asset.validate import Validation
+from tests.conftest import grid_sphere
+from tests.test_asset_gltf import write_glb
+from tests.test_asset_gltf_nodes import ball, document
+
+
+def count_calls(monkeypatch: pytest.MonkeyPatch, owner: object, name: str) -> Counter:
+    """Calls of a method or function by their first argument after the object, as they happen."""
+    calls: Counter = Counter()
+    original = getattr(owner, name)
+
+    def counted(*arguments: object) -> object:
+        calls[str(arguments[1] if isinstance(owner, type) else name)[:200]] += 1
+        return original(*arguments)
+
+    monkeypatch.setattr(owner, name, counted)
+    return calls
+
+
+def test_notes_of_a_kind_are_one_line() -> None:
+    note = Notes()
+    for k in range(5):
+        note(f"material 'm{k}': drawn opaque")
+        note(f"mesh 'n{k}': {k + 1} faces dropped")
+        note("animations dropped")
+    note("mesh 'n0': unusable tangents recomputed")
+    note("'/a': skinning dropped")
+    assert note.lines() == (
+        "materials 'm0', 'm1', 'm2' and 2 more: drawn opaque",
+        "meshes 'n0', 'n1', 'n2' and 2 more: 15 faces dropped",
+        "animations dropped",
+        "mesh 'n0': unusable tangents recomputed",
+        "'/a': skinning dropped",
+    )
+    many = Notes()
+    for k in range(100):
+        many(f"file {k} is not there", "files that are not there")
+    assert len(many.lines()) == LINES + 1 and many.lines()[-1] == "... and 92 more: files that are not there"
+
+
+def test_an_accessor_is_read_once_and_a_primitive_keeps_what_it_uses(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    positions, faces, _ = grid_sphere(8, 16)
+    given, binary = document({"POSITION": positions, "NORMAL": positions}, faces)
+    primitive = given["meshes"][0]["primitives"][0]
+    view = given["accessors"][primitive["indices"]]
+    given["meshes"] = []
+    for k in range(0, len(faces), 7):
+        given["accessors"].append(view | {"byteOffset": 12 * k, "count": 3 * len(faces[k : k + 7])})
+        given["meshes"].append({"primitives": [primitive | {"indices": len(given["accessors"]) - 1}]})
+    given["nodes"] = [{"mesh": k} for k in range(len(given["meshes"]))]
+    given["scenes"] = [{"nodes": list(range(len(given["nodes"])))}]
+    write_glb(tmp_path / "x.glb", given, binary)
+    calls = count_calls(monkeypatch, Document, "_read_accessor")
+    asset = load(tmp_path / "x.glb", mend=False)
+    assert max(calls.values()) == 1
+    assert len(asset.meshes) == len(given["meshes"])
+    assert all(len(m.positions) == len(np.unique(m.faces)) for m in asset.meshes)
+    got = np.concatenate([m.positions[m.faces] for m in asset.meshes])
+    np.testing.assert_array_equal(got, positions[faces])
+    assert not load(tmp_path / "x.glb").notes
+
+
+def test_nodes_that_share_a_mesh_read_it_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    positions, faces, _ = grid_sphere(4, 8)
+    nodes = [{"mesh": 0, "name": f"n{k}", "translation": [k, 0, 0]} for k in range(50)]
+    given, binary = document({"POSITION": positions, "NORMAL": positions}, faces, nodes=nodes)
+    given["scenes"] = [{"nodes": list(range(50))}]
+    write_glb(tmp_path / "x.glb", given, binary)
+    calls = count_calls(monkeypatch, _Reader, "_read")
+    asset = load(tmp_path / "x.glb")
+    assert calls.total() == 1
+    assert [m.name for m in asset.meshes] == [f"n{k}" for k in range(50)]
+    np.testing.assert_allclose(asset.meshes[49].positions, asset.meshes[0].positions + [49, 0, 0], atol=1e-5)
+
+
+def test_instances_are_one_mesh_with_turned_faces_where_they_are_mirrored(tmp_path: Path) -> None:
+    positions, faces = ball(1)
+    uvs = positions[:, :2].copy()
+    scale = np.array([[1, 1, 1], [-1, 1, 2], [1, -1, -1]], np.float32)
+    instancing = {"EXT_mesh_gpu_instancing": {"attributes": {"SCALE": 3}}}
+    given, binary = document(
+        {"POSITION": positions, "NORMAL": positions, "TEXCOORD_0": uvs}, faces, (scale,),
+        nodes=[{"mesh": 0, "extensions": instancing}], extensionsUsed=list(instancing),
+    )  # fmt: skip
+    write_glb(tmp_path / "x.glb", given, binary)
+    (mesh,) = load(tmp_path / "x.glb").meshes
+    n, f = len(positions), len(faces)
+    for k, s in enumerate(scale):
+        part = slice(k * n, (k + 1) * n)
+        np.testing.assert_allclose(mesh.positions[part], positions * s, atol=1e-6)
+        np.testing.assert_array_equal(mesh.uvs[part], uvs)
+        normals = positions / s
+        np.testing.assert_allclose(
+            mesh.normals[part], normals / np.linalg.norm(normals, axis=1, keepdims=True), atol=1e-5
+        )
+        turned = faces[:, ::-1] if np.prod(s) < 0 else faces
+        np.testing.assert_array_equal(mesh.faces[k * f : (k + 1) * f], turned + k * n)
+
+
+def spoilt_asset(count: int) -> tuple[Asset, list[int]]:
+    """(small meshes, numbers of those that have a fault of some kind)."""
+    positions, faces = ball(1)
+    normals, uvs = positions.copy(), positions[:, :2].copy()
+    nan = np.float32(np.nan)
+    faults = {
+        5: {"faces": np.concatenate([faces, [[0, 0, 1]]]).astype(np.int32)},
+        11: {"positions": np.concatenate([positions, [[9, 9, 9]]]).astype(np.float32), "normals": None, "uvs": None},
+        17: {"uvs": uvs * np.float32(1e9)},
+        23: {"normals": normals * nan},
+        29: {"normals": normals * 2},
+        31: {"tangents": np.zeros((len(positions), 4), np.float32)},
+        37: {"normals": None, "tangents": np.ones((len(positions), 4), np.float32)},
+        41: {"colors": positions},
+    }
+    meshes = [
+        replace(Mesh(positions, faces, normals, uvs, name=f"m{k}"), **faults.get(k, {}))  # type: ignore[arg-type]
+        for k in range(count)
+    ]
+    return Asset(tuple(meshes)), sorted(faults)
+
+
+def test_only_meshes_with_faults_are_mended_one_by_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    asset, faulty = spoilt_asset(300)
+    calls = count_calls(monkeypatch, validate, "_repair")
+    mended = validate.repair(asset, "x")
+    assert calls.total() == len(faulty)
+    monkeypatch.setattr(validate, "_suspects", lambda meshes: np.ones(len(meshes), bool))
+    each = validate.repair(asset, "x")
+    assert each.notes == mended.notes
+    for one, other in zip(mended.meshes, each.meshes, strict=True):
+        for name in ("positions", "faces", "normals", "uvs", "tangents", "colors"):
+            a, b = getattr(one, name), getattr(other, name)
+            assert (a is None) == (b is None)
+            if a is not None:
+                np.testing.assert_array_equal(a, b)
+
+
+def test_counts_of_many_meshes_are_the_sums_of_each() -> None:
+    asset, _ = spoilt_asset(60)
+    every = validate.validate(asset)
+    each = [validate.validate(replace(asset, meshes=(m,))) for m in asset.meshes]
+    for f in fields(Validation):
+        assert getattr(every, f.name) == sum(getattr(one, f.name) for one in each), f.name
+    assert every.connected_parts == 60 and every.degenerate_faces == 1 and every.unreferenced_vertices == 1
+
+
+class CountedReads(list):
+    """A list that counts how many of its elements are looked at."""
+
+    reads = 0
+
+    def __iter__(self):
+        self.reads += len(self)
+        return super().__iter__()
+
+    def __getitem__(self, key):
+        self.reads += 1
+        return super().__getitem__(key)
+
+
+@pytest.mark.parametrize("place", [uv_frames.unified, uv_frames.kept])
+def test_texture_frames_take_time_in_proportion_to_materials(place) -> None:
+    positions, faces, uvs = grid_sphere(2, 3)
+    reads = []
+    for count in (20, 200):
+        materials = [Material(f"m{k}") for k in range(count)]
+        meshes = CountedReads(Mesh(positions, faces, uvs=uvs, material=m) for m in materials)
+        place(meshes, {id(m): {} for m in materials}, lambda text: None)
+        reads.append(meshes.reads)
+    assert reads[1] == 10 * reads[0]
