@@ -152,11 +152,13 @@ class _Run:
         flat = face_normal(self.points.surface, points.triangle, mi.Bool(True))
         flat *= dr.rsqrt(dr.fmax(dr.squared_norm(flat), 1e-30))
         all_ = dr.full(mi.Bool, True, dr.width(points.texel))
-        out = exposed(self.points.scene, points.here.position, flat, all_, FAR)
+        front_only = _of(self.points.surface.culled, points.triangle)
+        out = exposed(self.points.scene, points.here.position, flat, all_, FAR, front_only)
         both = out & found.valid
         prim = dr.select(found.valid, found.triangle, 0)
         position, geometric, _ = self.reference.frame_at(prim, found.b1, found.b2)
-        return ~out | (both & ~exposed(self.reference.scene, position, geometric, both, FAR))
+        front_only = _of(self.reference.surface.culled, prim)
+        return ~out | (both & ~exposed(self.reference.scene, position, geometric, both, FAR, front_only))
 
     def _values(self, points: Points, found: Found, seed: int) -> list[mi.Float]:
         """All channels of the wanted fields, in order."""
@@ -181,6 +183,11 @@ class _Run:
             surface = self.reference.surface
             out["curvature"] = interpolate_packets(surface, self.curvature, prim, found.b1, found.b2, 1)
         return [x for f in fields for x in out[f]]
+
+
+def _of(culled: mi.Bool | None, triangle: mi.UInt32) -> mi.Bool | None:
+    """Is each triangle culled when it is seen from behind? None if none is."""
+    return None if culled is None else dr.gather(mi.Bool, culled, triangle)
 
 
 def in_frame_of(here: Hit, normal: mi.Vector3f) -> list[mi.Float]:

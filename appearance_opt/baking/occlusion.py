@@ -8,11 +8,13 @@ from typing import TYPE_CHECKING
 import drjit as dr
 import mitsuba as mi
 
+from appearance_opt.render.passing import blocked
 from appearance_opt.render.rays import sub_pixel_offsets
 
 if TYPE_CHECKING:
     from appearance_opt.baking.search import Found
     from appearance_opt.reference.mesh import MeshReference
+    from appearance_opt.render.passing import Scene
 
 LIFT = 1e-4
 """How far rays start above the surface, in units of the object's radius (1 in the frame of a bake)."""
@@ -49,15 +51,18 @@ def openness(
         # the interpolated normal's hemisphere dips below coarse faces: turn such rays up again
         below = dr.dot(d, geometric)
         d = dr.select(below < 0, d - geometric * (2 * below), d)
-        hit = reference.scene.ray_test(mi.Ray3f(origin, d, length, 0, mi.Color0f()), active=found.valid)
+        hit = blocked(reference.scene, mi.Ray3f(origin, d, length, 0, mi.Color0f()), found.valid)
         free += dr.select(hit, mi.Float(0), mi.Float(1))
         dr.eval(free)
     return free * dr.opaque(mi.Float, 1 / rays)
 
 
-def exposed(scene: mi.Scene, position: mi.Point3f, normal: mi.Vector3f, active: mi.Bool, far: float) -> mi.Bool:
+def exposed(
+    scene: Scene, position: mi.Point3f, normal: mi.Vector3f, active: mi.Bool, far: float, culled: mi.Bool | None = None
+) -> mi.Bool:
     """Which of the ``active`` points of a surface something outside can see, from either side: those from which some
-    ray gets away. Where parts touch, both surfaces are hidden. ``far``: a distance beyond which there is nothing."""
+    ray gets away. Where parts touch, both surfaces are hidden. ``far``: a distance beyond which there is nothing.
+    ``culled``: points that are seen from the side of their ``normal`` only."""
     out = dr.zeros(mi.Bool, dr.width(position))
     left = dr.compress(active)
     length = dr.opaque(mi.Float, far)
@@ -66,12 +71,17 @@ def exposed(scene: mi.Scene, position: mi.Point3f, normal: mi.Vector3f, active: 
             break
         p, n = (dr.gather(type(x), x, left) for x in (position, normal))
         hidden = dr.full(mi.Bool, True, dr.width(left))
-        dr.eval(p, n, hidden)
+        front_only = None if culled is None else dr.gather(mi.Bool, culled, left)
+        dr.eval(p, n, hidden, front_only)
         for x, y in sub_pixel_offsets(count):
             # the same directions everywhere: what is hidden is of one piece
             d = n if number == 0 else dr.opaque(mi.Vector3f, _on_sphere(float(x), float(y)))
-            side = dr.select(dr.dot(d, n) < 0, mi.Float(-LIFT), mi.Float(LIFT))
-            hidden &= scene.ray_test(mi.Ray3f(dr.fma(n, side, p), d, length, 0, mi.Color0f()), active=hidden)
+            below = dr.dot(d, n) < 0
+            if front_only is not None:
+                d = dr.select(below & front_only, -d, d)
+                below &= ~front_only
+            side = dr.select(below, mi.Float(-LIFT), mi.Float(LIFT))
+            hidden &= blocked(scene, mi.Ray3f(dr.fma(n, side, p), d, length, 0, mi.Color0f()), hidden)
             dr.eval(hidden)
         dr.scatter(out, ~hidden, left)
         left = dr.gather(mi.UInt32, left, dr.compress(hidden))

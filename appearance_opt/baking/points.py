@@ -18,6 +18,8 @@ from appearance_opt.render.surface import Hit, Surface, interpolate_at
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from appearance_opt.render.passing import Scene
+
 BAND = 1 << 20
 """Texels worked on at once: more saves no time and costs memory."""
 
@@ -48,16 +50,17 @@ class TexelPoints:
         self.mesh, self.size, self.samples = mesh, size, samples
         self.rows = max(1, min(size, BAND // size))
         positions = np.ascontiguousarray(mesh.positions, np.float32)
-        self.surface = LatentTopology(mesh, tangents=True).surface(mi.Float(positions.ravel()))
+        self._topology = LatentTopology(mesh, tangents=True)
+        self.surface = self._topology.surface(mi.Float(positions.ravel()))
         self.atlas = atlas_scene(mesh)
         self._directions: mi.Float | None = None
         if mesh.normals is not None:
             self._directions = upload.packets(4, vertex_normals(positions, mesh.faces))
 
     @cached_property
-    def scene(self) -> mi.Scene:
+    def scene(self) -> Scene:
         """The mesh itself, for rays; made when first asked for."""
-        return upload.scene_of(self.mesh.positions, self.mesh.faces)
+        return self._topology.scene()
 
     def band(self, row: int, dx: float, dy: float) -> Points | None:
         """Points under (dx, dy), in texels, of the texels of ``rows`` rows from ``row`` on; None if there

@@ -10,12 +10,14 @@ import mitsuba as mi
 import numpy as np
 
 from appearance_opt.render import upload
+from appearance_opt.render.passing import meet, numbers_of, parts_of, scene_in
 from appearance_opt.render.surface import face_normal
 
 if TYPE_CHECKING:
     from appearance_opt.baking.points import Points
     from appearance_opt.latent.latent import LatentMesh
     from appearance_opt.reference.mesh import MeshReference
+    from appearance_opt.render.passing import Half
 
 LAYERS = 3
 """Surfaces that a ray passes through in search of one that faces the same way."""
@@ -73,17 +75,35 @@ def _facing_hit(
 ) -> tuple[mi.UInt32, mi.Float, mi.Float, mi.Float]:
     """(triangle, barycentrics, distance) of the first hit of rays whose triangle faces the way of
     ``facing``, passing through at most ``LAYERS`` others; infinite distance if there is none."""
+    found = [_first_facing(reference, p, origin, direction, facing, length) for p in parts_of(reference.scene)]
+    if len(found) == 1:
+        return found[0]
+    first = found[0][3] <= found[1][3]
+    prim, b1, b2, distance = (dr.select(first, a, b) for a, b in zip(*found, strict=True))
+    return prim, b1, b2, distance
+
+
+def _first_facing(
+    reference: MeshReference,
+    part: mi.Scene | Half,
+    origin: mi.Point3f,
+    direction: mi.Vector3f,
+    facing: mi.Vector3f,
+    length: mi.Float,
+) -> tuple[mi.UInt32, mi.Float, mi.Float, mi.Float]:
+    """The same among the faces of one part of the reference's scene."""
+    scene = scene_in(part)
     start = mi.Float(0)
     prim, b1, b2 = mi.UInt32(0), mi.Float(0), mi.Float(0)
     distance = dr.full(mi.Float, dr.inf, dr.width(origin))
     for _ in range(LAYERS):
         open_ = ~dr.isfinite(distance) & (start < length)
         ray = mi.Ray3f(dr.fma(direction, start, origin), direction, length, 0, mi.Color0f())
-        hit = reference.scene.ray_intersect_preliminary(ray, coherent=False, active=open_)
+        hit = scene.ray_intersect_preliminary(ray, coherent=False, active=open_)
         valid = hit.is_valid() & open_
-        at = start + hit.t
-        same = valid & (dr.dot(face_normal(reference.surface, hit.prim_index, valid), facing) > 0)
-        prim = dr.select(same, hit.prim_index, prim)
+        at, number = start + hit.t, numbers_of(part, hit.prim_index, valid)
+        same = valid & (dr.dot(face_normal(reference.surface, number, valid), facing) > 0)
+        prim = dr.select(same, number, prim)
         b1, b2 = dr.select(same, hit.prim_uv.x, b1), dr.select(same, hit.prim_uv.y, b2)
         distance = dr.select(same, at, distance)
         start = dr.select(valid, at * (1 + 1e-4) + 1e-6 * length, dr.inf)
@@ -102,11 +122,10 @@ def deviation(reference: MeshReference, mesh: LatentMesh) -> float:
     mesh, measured along the reference's normals."""
     merged = reference.merged
     every = max(1, len(merged.positions) // 50_000)
-    p, n = merged.positions[::every], merged.normals[::every]
+    p, normals = merged.positions[::every], merged.normals[::every]
     scene = upload.scene_of(mesh.positions, mesh.faces)
-    position, normal = mi.Point3f(p.T), mi.Vector3f(n.T)
-    out = scene.ray_intersect_preliminary(mi.Ray3f(position, normal), coherent=False).t
-    back = scene.ray_intersect_preliminary(mi.Ray3f(position, -normal), coherent=False).t
+    position, normal = mi.Point3f(p.T), mi.Vector3f(normals.T)
+    out, back = (meet(scene, mi.Ray3f(position, n)).t for n in (normal, -normal))
     nearest = np.array(dr.fmin(out, back))
     nearest = nearest[np.isfinite(nearest)]
     diagonal = float(np.linalg.norm(np.ptp(merged.positions, axis=0)))

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from appearance_opt.render.passing import Scene
     from appearance_opt.render.surface import Surface
 
 POSITIONS, TEXELS = "positions", "texels"
@@ -63,7 +64,7 @@ class Drawn:
         self.topology = LatentTopology(mesh, tangents) if self.tessellator is None else self.tessellator.topology
         drawn = self.topology.mesh
         self.edge_length = local_edge_length(drawn.positions, drawn.faces)
-        self._moving = upload.MovingScene(drawn.positions, drawn.faces)
+        self._moving = upload.MovingScene(drawn.positions, drawn.faces, self.topology.culled)
         self.scene = self._moving.scene
 
     def pose(self, shape: Shape) -> mi.Float:
@@ -154,7 +155,7 @@ class Model:
         return {level: drawn.topology for level, drawn in self._drawn.items()}
 
     @property
-    def scene(self) -> mi.Scene:
+    def scene(self) -> Scene:
         """The drawn mesh, for tracing rays."""
         return self.drawn.scene
 

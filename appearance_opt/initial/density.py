@@ -16,7 +16,7 @@ import numpy as np
 from appearance_opt.initial.atlas import charts_of, uv_areas
 from appearance_opt.latent.latent import LatentTopology
 from appearance_opt.latent.texels import TexelCodec
-from appearance_opt.render import rays, upload
+from appearance_opt.render import rays
 from appearance_opt.render.deferred import Grid, render_image
 from appearance_opt.render.display import display
 from appearance_opt.render.material import CHANNELS, MaterialMaps
@@ -56,7 +56,8 @@ def chart_scales(mesh: LatentMesh, maps: Mapping[str, NDArray], sampler: ViewSam
 
 def _loss_of_half(mesh: LatentMesh, maps: Mapping[str, NDArray], sampler: ViewSampler) -> NDArray[np.float64]:
     """(F,) squared display error that maps at half the resolution make, over the pixels that show each face."""
-    scene, topology = upload.scene_of(mesh.positions, mesh.faces), LatentTopology(mesh, tangents="normal_x" in maps)
+    topology = LatentTopology(mesh, tangents="normal_x" in maps)
+    scene = topology.scene()
     surface = topology.surface(mi.Float(np.ascontiguousarray(mesh.positions, np.float32).ravel()))
     names = tuple(c for c in CHANNELS if c in maps)
     codec = TexelCodec(names, len(maps[names[0]]))

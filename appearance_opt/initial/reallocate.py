@@ -18,7 +18,7 @@ from scipy.ndimage import maximum_filter
 from appearance_opt.initial.visibility import around, welded_areas
 from appearance_opt.latent.latent import LatentTopology
 from appearance_opt.latent.texels import TexelCodec
-from appearance_opt.render import rays, upload
+from appearance_opt.render import rays
 from appearance_opt.render.deferred import Grid, render_image
 from appearance_opt.render.display import display
 from appearance_opt.render.material import CHANNELS, MaterialMaps
@@ -58,7 +58,8 @@ class StartError:
     def measure(self, mesh: LatentMesh, maps: Mapping[str, NDArray]) -> tuple[float, NDArray[np.float64]]:
         """(mean squared display error, its sum over the pixels that show each face of the reference (F,))."""
         total = dr.zeros(mi.UInt64, len(self.reference.merged.faces))
-        scene, topology = upload.scene_of(mesh.positions, mesh.faces), LatentTopology(mesh, tangents=True)
+        topology = LatentTopology(mesh, tangents=True)
+        scene = topology.scene()
         codec = TexelCodec(tuple(c for c in CHANNELS if c in maps), len(maps["red"]))
         layers = MaterialMaps((codec.layer(codec.encode(maps)),))
         surface = topology.surface(mi.Float(np.ascontiguousarray(mesh.positions, np.float32).ravel()))

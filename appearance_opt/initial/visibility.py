@@ -15,6 +15,7 @@ from appearance_opt.render.deferred import Grid
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from appearance_opt.render.passing import Scene
     from appearance_opt.views import ViewSampler
 
 MARGIN = 2
@@ -26,7 +27,7 @@ HIDDEN, FLOOR = 1e-4, 0.05
 
 
 def pixel_counts(
-    scene: mi.Scene, faces: int, sampler: ViewSampler, views: int, resolution: int = 256, batch: int = 8
+    scene: Scene, faces: int, sampler: ViewSampler, views: int, resolution: int = 256, batch: int = 8
 ) -> NDArray[np.int64]:
     """(faces,) number of pixels in which each face was seen over ``views`` random views."""
     total = dr.zeros(mi.UInt32, faces)

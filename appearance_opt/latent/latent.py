@@ -11,6 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from appearance_opt.asset.normals import weld
+from appearance_opt.asset.sides import culled
 from appearance_opt.latent import mesh_ops
 from appearance_opt.latent.mesh_ops import Corners
 from appearance_opt.render import upload
@@ -19,6 +20,8 @@ from appearance_opt.render.surface import Surface
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
+
+    from appearance_opt.render.passing import Scene
 
 
 @dataclass(frozen=True)
@@ -31,6 +34,8 @@ class LatentMesh:
 
     ``normals`` (V, 3), ``tangents`` (R, 4), given together: frames of a mesh that keeps its shape and its own
     normals. Its vertices are then split at hard edges, too, and only texels can be fitted.
+
+    ``single`` (F,): faces that are seen from their front only; None: all are seen from both sides.
     """
 
     positions: NDArray[np.float32]
@@ -40,10 +45,12 @@ class LatentMesh:
     uvs: NDArray[np.float32]
     normals: NDArray[np.float32] | None = None
     tangents: NDArray[np.float32] | None = None
+    single: NDArray[np.bool_] | None = None
 
 
 class LatentTopology:
-    """Everything about a latent that never changes during a fit, precomputed once."""
+    """Everything about a latent that never changes during a fit, precomputed once. ``culled`` (F,): faces that are not
+    to be seen from behind (see ``asset.sides``), None without any."""
 
     def __init__(self, mesh: LatentMesh, tangents: bool) -> None:
         self.mesh = mesh
@@ -53,7 +60,9 @@ class LatentTopology:
         self.frame_faces = upload.index_packets(mesh.frame_faces)
         # silhouettes run along welded edges: a seam is none
         self.welded_faces = mesh.faces if mesh.normals is None else welded(mesh.positions, mesh.faces)
-        self.edges = edge_list(self.welded_faces)
+        self.culled = culled(mesh.positions, mesh.faces, mesh.single)
+        self._culled = None if self.culled is None else mi.Bool(self.culled)
+        self.edges = edge_list(self.welded_faces, self.culled)
         self.handedness = mi.Float(handedness(mesh))
         self._fixed = self._fixed_surface() if mesh.normals is not None else None
 
@@ -76,7 +85,11 @@ class LatentTopology:
         else:
             frames = self.corners.uvs
         dr.eval(vertices, frames)
-        return Surface(self.faces, vertices, self.frame_faces, frames, None, self.tangents)
+        return Surface(self.faces, vertices, self.frame_faces, frames, None, self.tangents, self._culled)
+
+    def scene(self) -> Scene:
+        """The mesh where it was at first, for tracing rays."""
+        return upload.scene_of(self.mesh.positions, self.mesh.faces, self.culled)
 
     def _fixed_surface(self) -> Surface:
         m = self.mesh
@@ -85,7 +98,7 @@ class LatentTopology:
         frames = self.corners.uvs
         if self.tangents:
             frames = upload.packets(8, m.uvs, m.tangents[:, 3], np.zeros(len(m.uvs)), m.tangents[:, :3])
-        return Surface(self.faces, vertices, self.frame_faces, frames, None, self.tangents)
+        return Surface(self.faces, vertices, self.frame_faces, frames, None, self.tangents, self._culled)
 
 
 def welded(positions: NDArray, faces: NDArray) -> NDArray[np.intp]:

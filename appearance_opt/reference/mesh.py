@@ -11,7 +11,7 @@ import numpy as np
 
 from appearance_opt.asset.normals import split_where_cancelled, summed_normals
 from appearance_opt.asset.packing import EMISSION
-from appearance_opt.asset.sides import single_sided
+from appearance_opt.asset.sides import culled, single_sided
 from appearance_opt.asset.tangents import any_tangent, split_and_tangents
 from appearance_opt.reference.textures import emission_maps, material_maps
 from appearance_opt.render import deferred, upload
@@ -62,7 +62,8 @@ class MeshReference:
         self.merged = merge(asset, [materials.index(id(m.material)) for m in asset.meshes], self.maps.has_normal_map)
         m = self.merged
         self.single = single_sided(asset.meshes)
-        self.scene = upload.scene_of(m.positions, m.faces)
+        hidden_backs = culled(m.positions, m.faces, self.single)
+        self.scene = upload.scene_of(m.positions, m.faces, hidden_backs)
         if m.tangents is None:
             frames = upload.packets(2, m.uvs)
         else:
@@ -74,6 +75,7 @@ class MeshReference:
             frames=frames if self.maps.layers or (self.emission is not None and self.emission.layers) else None,
             colors=None if m.colors is None else upload.packets(4, m.colors),
             has_tangents=m.tangents is not None,
+            culled=None if hidden_backs is None else mi.Bool(hidden_backs),
         )
         self._run = Frozen(self.surface, self.maps)
         self._grid: Grid | None = None

@@ -22,6 +22,7 @@ from appearance_opt.render.surface import Surface, interpolate
 
 if TYPE_CHECKING:
     from appearance_opt.render.freezing import Run
+    from appearance_opt.render.passing import Scene
 
 NEAREST_LIGHT = 1e-3
 """Distance below which a light gets no brighter (the object's radius is 1 in a fit): a point light that touches a
@@ -92,7 +93,7 @@ class Drawing:
 
 
 def render_image(
-    scene: mi.Scene,
+    scene: Scene,
     surface: Surface,
     maps: MaterialMaps,
     records: mi.Float,
@@ -122,7 +123,7 @@ def render_image(
 
 
 def render_pair(
-    scene: mi.Scene,
+    scene: Scene,
     surface: Surface,
     maps: MaterialMaps,
     records: mi.Float,
@@ -150,7 +151,7 @@ def render_pair(
 
 
 def _seen(
-    scene: mi.Scene, drawing: Drawing, grid: Grid, dx: float, dy: float, run: Run
+    scene: Scene, drawing: Drawing, grid: Grid, dx: float, dy: float, run: Run
 ) -> tuple[Samples, mi.Float, mi.UInt32]:
     """(what every pixel shows at the offset (dx, dy), its depth, indices of those that show anything)."""
     hits, depth, hit = visible(scene, drawing.surface, drawing.records, grid, dx, dy, run)
@@ -158,14 +159,14 @@ def _seen(
 
 
 def visible(
-    scene: mi.Scene, surface: Surface, records: mi.Float, grid: Grid, dx: float, dy: float, run: Run
+    scene: Scene, surface: Surface, records: mi.Float, grid: Grid, dx: float, dy: float, run: Run
 ) -> tuple[Samples, mi.Float, mi.Bool]:
     """(what every pixel shows at the offset (dx, dy), its depth, does it show anything?). By rays through ``scene`` or
     by drawing ``surface``, the same mesh, whichever is faster."""
     at = grid.view, grid.column, grid.row, dr.opaque(mi.Float, dx), dr.opaque(mi.Float, dy), grid.size
     if raster.pays(surface, grid):
         mesh = surface.vertices, surface.faces, records
-        hits, depth = run(raster.visible, *mesh, *at, grid.rows, grid.views, grid.pixels)
+        hits, depth = run(raster.visible, *mesh, *at, grid.rows, grid.views, grid.pixels, surface.culled)
     else:
         hits, depth = run(_traced_at, scene, records, *at)
     hit = hits.triangle != rays.MISS
@@ -174,7 +175,7 @@ def visible(
 
 
 def _traced_at(
-    scene: mi.Scene,
+    scene: Scene,
     records: mi.Float,
     view: mi.UInt32,
     column: mi.UInt32,

@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from appearance_opt.render.freezing import Run
+    from appearance_opt.render.passing import Scene
 
 
 VISIBILITY = ("edges", "pairs", "none")
@@ -109,7 +110,7 @@ class Frame:
 
 
 def render(
-    scene: mi.Scene,
+    scene: Scene,
     surface: Surface,
     maps: MaterialMaps,
     edge_list: EdgeList | None,
@@ -229,7 +230,7 @@ def backward(terms: list[mi.Float]) -> None:
 
 
 def _camera_samples(
-    scene: mi.Scene,
+    scene: Scene,
     surface: Surface,
     records: mi.Float,
     grid: Grid,

@@ -41,6 +41,7 @@ from appearance_opt.render.weighted import Weighted, Whole, concat, joined
 if TYPE_CHECKING:
     from appearance_opt.render.freezing import Run
     from appearance_opt.render.gradient import Quality
+    from appearance_opt.render.passing import Scene
 
 
 @dataclass
@@ -86,7 +87,7 @@ class _Fine:
 
 
 def paired_samples(
-    scene: mi.Scene,
+    scene: Scene,
     edges: EdgeList,
     vertices: mi.Float,
     records: mi.Float,
@@ -117,7 +118,7 @@ def paired_samples(
 
 
 def meeting_points(
-    scene: mi.Scene,
+    scene: Scene,
     edges: EdgeList,
     vertices: mi.Float,
     records: mi.Float,
@@ -136,7 +137,7 @@ def meeting_points(
 
 
 def _middles(
-    scene: mi.Scene, records: mi.Float, view: mi.UInt32, column: mi.UInt32, row: mi.UInt32, size: mi.Float
+    scene: Scene, records: mi.Float, view: mi.UInt32, column: mi.UInt32, row: mi.UInt32, size: mi.Float
 ) -> tuple[Samples, mi.Float]:
     """What the rays through the middles of all pixels hit, and the depth of the hits."""
     return rays.trace_depth(scene, records, view, mi.Float(column) + 0.5, mi.Float(row) + 0.5, size)

@@ -53,13 +53,15 @@ def visible(
     rows: mi.UInt32,
     views: int,
     pixels: int,
+    culled: mi.Bool | None = None,
 ) -> tuple[Samples, mi.Float]:
     """What the surface shows at the offset (dx, dy) in pixels (view, column, row), and its depth (see
     ``rays.trace_depth``). ``vertices``, ``faces``: packets of ``Surface``; ``size``, ``rows``: see ``Grid``;
-    ``pixels`` of all ``views``. Of triangles at exactly the same depth the first is seen."""
+    ``pixels`` of all ``views``; ``culled``: see ``Surface``. Of triangles at exactly the same depth the first is
+    seen."""
     projected = _projected(vertices, records, views, size)
     dr.eval(projected)
-    image = _drawn(projected, faces, views, rows, pixels, dx, dy)
+    image = _drawn(projected, faces, views, rows, pixels, dx, dy, culled)
     dr.eval(image)
     nearest = dr.gather(mi.UInt64, image, (view * rows + row) * rows + column)
     triangle = mi.UInt32(nearest & 0xFFFFFFFF)
@@ -87,7 +89,14 @@ def _projected(vertices: mi.Float, records: mi.Float, views: int, size: mi.Float
 
 
 def _drawn(
-    projected: mi.Float, faces: mi.UInt32, views: int, rows: mi.UInt32, pixels: int, dx: mi.Float, dy: mi.Float
+    projected: mi.Float,
+    faces: mi.UInt32,
+    views: int,
+    rows: mi.UInt32,
+    pixels: int,
+    dx: mi.Float,
+    dy: mi.Float,
+    culled: mi.Bool | None,
 ) -> mi.UInt64:
     """(pixels,) the bits of the nearest depth, above the number of the triangle there; ``NOTHING`` where none is."""
     triangles, stride = dr.width(faces) // 4, dr.width(projected) // 4 // views
@@ -104,6 +113,9 @@ def _drawn(
     v = [mi.Vector3f(q[0] - (x0 + dx) * q[2], q[1] - (y0 + dy) * q[2], q[2]) for q in p]
     edges = [dr.cross(v[1], v[2]), dr.cross(v[2], v[0]), dr.cross(v[0], v[1])]
     volume = dr.dot(v[0], edges[0])
+    if culled is not None:
+        # to the right, down and forward are axes like x, y and z: the volume of a front is negative
+        somewhere &= (volume < 0) | ~dr.gather(mi.Bool, culled, triangle)
     edges = [dr.select(volume < 0, -e, e) for e in edges]
     wide, high = x1 - x0, y1 - y0
     slack = [-SLACK * (dr.abs(e.x) * (wide + 1) + dr.abs(e.y) * (high + 1) + dr.abs(e.z)) for e in edges]

@@ -11,17 +11,16 @@ import mitsuba as mi
 import numpy as np
 
 from appearance_opt.render.freezing import traced
+from appearance_opt.render.passing import MISS, meet
 from appearance_opt.views import RECORD
 
 if TYPE_CHECKING:
     from appearance_opt.render.freezing import Run
+    from appearance_opt.render.passing import Scene
 
 TILE = 4
 """Rays are ordered in tiles of 4 x 4 pixels: neighbours in the wavefront are neighbours in the image,
 which makes tracing 30 % faster than scan lines (measured)."""
-
-MISS = 0xFFFFFFFF
-"""Number of the triangle of a ray that hits none."""
 
 
 @dataclass
@@ -85,27 +84,24 @@ def pixel_grid(views: int, resolution: int) -> tuple[mi.UInt32, mi.UInt32, mi.UI
     return dr.gather(mi.UInt32, view, keep), dr.gather(mi.UInt32, column, keep), dr.gather(mi.UInt32, row, keep)
 
 
-def trace(
-    scene: mi.Scene, records: mi.Float, view: mi.UInt32, x: mi.Float, y: mi.Float, resolution: mi.Float
-) -> Samples:
-    """Closest hit of the camera rays through pixel positions (x, y) of the given views."""
+def trace(scene: Scene, records: mi.Float, view: mi.UInt32, x: mi.Float, y: mi.Float, resolution: mi.Float) -> Samples:
+    """What camera rays through pixel positions (x, y) of the given views see."""
     return trace_depth(scene, records, view, x, y, resolution)[0]
 
 
 def trace_depth(
-    scene: mi.Scene, records: mi.Float, view: mi.UInt32, x: mi.Float, y: mi.Float, resolution: mi.Float
+    scene: Scene, records: mi.Float, view: mi.UInt32, x: mi.Float, y: mi.Float, resolution: mi.Float
 ) -> tuple[Samples, mi.Float]:
     """The same, and the depth of the hits along ``forward`` (infinite for a miss)."""
     camera = camera_of(records, view)
     d = direction(camera, x, y, resolution)
     inverse_length = dr.rsqrt(dr.squared_norm(d))
-    hit = scene.ray_intersect_preliminary(mi.Ray3f(camera.eye, d * inverse_length), coherent=True)
-    triangle = dr.select(hit.is_valid(), hit.prim_index, MISS)
-    return Samples(view, x, y, triangle), hit.t * inverse_length
+    met = meet(scene, mi.Ray3f(camera.eye, d * inverse_length), coherent=True)
+    return Samples(view, x, y, met.triangle), met.t * inverse_length
 
 
 def trace_pixels(
-    scene: mi.Scene,
+    scene: Scene,
     records: mi.Float,
     view: mi.UInt32,
     column: mi.UInt32,
@@ -127,7 +123,7 @@ def trace_pixels(
 
 
 def _in_pixels(
-    scene: mi.Scene,
+    scene: Scene,
     records: mi.Float,
     view: mi.UInt32,
     column: mi.UInt32,

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 
     from appearance_opt.render.deferred import Grid
     from appearance_opt.render.freezing import Run
+    from appearance_opt.render.passing import Scene
 
 OFFSET = 1e-6
 """Distance of the two rays from the edge, in widths of the image: eight times the rounding of a ray's direction. Fine
@@ -54,11 +55,16 @@ class EdgeList:
     ``around``: for walks over the mesh (see ``walkable``), packets (three vertices, 0, three edges, 0, three
     neighbours, 0) per face; edge k runs from vertex k to the next, and the neighbour lies beyond it (the face itself
     where there is not exactly one).
+
+    ``sides``: for faces that are not to be seen from behind, sums of the following bits per edge; None without any. Of
+    the face with the first opposite vertex: 1 if it is culled, 2 if it runs from a to b by its winding; of that with
+    the other one: 4 and 8. Where an edge has more than two faces none of them is culled here: some are seen.
     """
 
     packets: mi.UInt32
     count: int
     around: mi.UInt32 | None = None
+    sides: mi.UInt32 | None = None
 
 
 @dataclass
@@ -100,12 +106,19 @@ class EdgeSamples:
         )
 
 
-def edge_list(faces: NDArray) -> EdgeList:
-    """All edges of a welded mesh (F, 3)."""
-    low, high, opposite, _, heads, uses = _sorted_edges(faces)
-    other = np.where(uses == 2, opposite[np.minimum(heads + 1, len(low) - 1)], high[heads])
+def edge_list(faces: NDArray, culled: NDArray | None = None) -> EdgeList:
+    """All edges of a welded mesh (F, 3). ``culled`` (F,): see ``Surface.culled``."""
+    low, high, opposite, order, heads, uses = _sorted_edges(faces)
+    second = np.minimum(heads + 1, len(low) - 1)
+    other = np.where(uses == 2, opposite[second], high[heads])
     packets = np.stack([low[heads], high[heads], opposite[heads], other], axis=1).astype(np.uint32)
-    return EdgeList(mi.UInt32(packets.ravel()), len(heads))
+    sides = None
+    if culled is not None:
+        corner, face = np.divmod(order, len(faces))
+        bits = np.where(culled[face], 1, 0) + np.where(faces[face, corner] == low, 2, 0)
+        bits = np.where(uses <= 2, bits[heads], 0) + np.where(uses == 2, 4 * bits[second], 0)
+        sides = mi.UInt32(bits.astype(np.uint32))
+    return EdgeList(mi.UInt32(packets.ravel()), len(heads), sides=sides)
 
 
 def walkable(edges: EdgeList, faces: NDArray) -> EdgeList:
@@ -165,7 +178,7 @@ def _candidates(
     edge = dr.gather(mi.ArrayXu, edges.packets, i - view * edges.count, shape=(4, views * edges.count))
     camera = rays.camera_of(records, view)
     a, b = position(vertices, edge[0]), position(vertices, edge[1])
-    silhouette = is_silhouette(edge, a, b, vertices, camera)
+    silhouette = is_silhouette(edges, i - view * edges.count, edge, a, b, vertices, camera)
     ax, ay, az = project(camera, a, resolution)
     bx, by, bz = project(camera, b, resolution)
     length = dr.sqrt(dr.square(bx - ax) + dr.square(by - ay))
@@ -176,16 +189,37 @@ def _candidates(
     return visible, length
 
 
-def is_silhouette(edge: mi.ArrayXu, a: mi.Point3f, b: mi.Point3f, vertices: mi.Float, camera: rays.Camera) -> mi.Bool:
-    """Do both faces of the edges (packets of ``EdgeList``, from ``a`` to ``b``) lie on one side of the plane through
-    eye and edge? No winding is needed."""
+def is_silhouette(
+    edges: EdgeList,
+    index: mi.UInt32,
+    edge: mi.ArrayXu,
+    a: mi.Point3f,
+    b: mi.Point3f,
+    vertices: mi.Float,
+    camera: rays.Camera,
+) -> mi.Bool:
+    """Do both faces of the edges of numbers ``index`` (with packets ``edge``, from ``a`` to ``b``) lie on one side of
+    the plane through eye and edge? No winding is needed, but for culled faces: what turns its back to the eye is not
+    there."""
     m = dr.cross(a - camera.eye, b - a)
     side, other_side = (dr.dot(m, position(vertices, edge[k]) - a) for k in (2, 3))
-    return (edge[3] == edge[1]) | (side * other_side > 0)
+    boundary = edge[3] == edge[1]
+    out = boundary | (side * other_side > 0)
+    if edges.sides is None:
+        return out
+    bits = dr.gather(mi.UInt32, edges.sides, index)
+    gone, other_gone = _turned_away(bits, side), boundary | _turned_away(bits >> 2, other_side)
+    return (out | (gone != other_gone)) & ~(gone & other_gone)
+
+
+def _turned_away(bits: mi.UInt32, side: mi.Float) -> mi.Bool:
+    """Does a culled face turn its back to the eye? ``bits`` of ``EdgeList.sides``; ``side``: product of its opposite
+    vertex, from the edge on, and the normal of the plane through eye and edge."""
+    return ((bits & 1) != 0) & (dr.select((bits & 2) != 0, side, -side) > 0)
 
 
 def sample_edges(
-    scene: mi.Scene,
+    scene: Scene,
     edges: EdgeList,
     vertices: mi.Float,
     records: mi.Float,
@@ -235,7 +269,7 @@ class Strata:
 
 
 def _points(
-    scene: mi.Scene,
+    scene: Scene,
     edges: EdgeList,
     vertices: mi.Float,
     records: mi.Float,
@@ -259,10 +293,11 @@ def _points(
     camera = rays.camera_of(records, view)
     ax, ay, az = project(camera, position(vertices, ends[0]), resolution)
     bx, by, bz = project(camera, position(vertices, ends[1]), resolution)
-    ox, oy, oz = project(camera, position(vertices, ends[2]), resolution)
+    opposite = _seen_opposite(edges, edge, ends, vertices, camera)
+    ox, oy, oz = project(camera, position(vertices, opposite), resolution)
     nx, ny = ay - by, bx - ax
     scale = dr.rsqrt(dr.fma(nx, nx, ny * ny))
-    # outward: away from the face's third vertex; one behind the camera is projected to the other side
+    # outward: away from the third vertex of a face that is there; one behind the camera is projected to the other side
     scale = dr.select((nx * (ox - ax) + ny * (oy - ay) > 0) == (oz > 0), -scale, scale)
     nx, ny = nx * scale, ny * scale
     x, y = dr.lerp(ax, bx, s), dr.lerp(ay, by, s)
@@ -278,6 +313,18 @@ def _points(
     visible &= hits[0].triangle != hits[1].triangle
     pixel = (view * rows + mi.UInt32(y)) * rows + mi.UInt32(x)
     return EdgeSamples(edge, view, s, pixel, mi.Float(strata.spacing), nx, ny, hits[0], hits[1]), visible
+
+
+def _seen_opposite(
+    edges: EdgeList, index: mi.UInt32, ends: mi.ArrayXu, vertices: mi.Float, camera: rays.Camera
+) -> mi.UInt32:
+    """The opposite vertex of a face of each silhouette that is not culled."""
+    if edges.sides is None:
+        return ends[2]
+    a = position(vertices, ends[0])
+    m = dr.cross(a - camera.eye, position(vertices, ends[1]) - a)
+    side = dr.dot(m, position(vertices, ends[2]) - a)
+    return dr.select(_turned_away(dr.gather(mi.UInt32, edges.sides, index), side), ends[3], ends[2])
 
 
 def _first_not_below(ascending: mi.Float64, value: mi.Float64, last: mi.UInt32, longest: int) -> mi.UInt32:

@@ -32,7 +32,8 @@ class Surface:
     normal, 0. ``corners`` (4 F): three indices into ``frames`` and 0, or None where they equal the
     vertex indices. ``frames`` (8 R): u, v, handedness, 0, tangent, 0; or (2 R): u, v without a normal
     map (``has_tangents`` is False then); or None without texture coordinates. ``colors`` (4 V): linear
-    vertex colour, 0, or None. ``vertices`` and ``frames`` may carry gradients.
+    vertex colour, 0, or None. ``vertices`` and ``frames`` may carry gradients. ``culled`` (F,): faces that are not
+    to be seen from behind (see ``asset.sides.culled``), or None without any.
     """
 
     faces: mi.UInt32
@@ -41,6 +42,7 @@ class Surface:
     frames: mi.Float | None = None
     colors: mi.Float | None = None
     has_tangents: bool = True
+    culled: mi.Bool | None = None
 
 
 @dataclass

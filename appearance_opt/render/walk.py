@@ -120,7 +120,7 @@ def walk(
         walking &= furthest <= 1
         edge = dr.gather(mi.ArrayXu, packets, leaves, walking, shape=(4, count))
         a, b = silhouette.position(vertices, edge[0]), silhouette.position(vertices, edge[1])
-        ends = walking & silhouette.is_silhouette(edge, a, b, vertices, camera)
+        ends = walking & silhouette.is_silhouette(edges, dr.select(walking, leaves, 0), edge, a, b, vertices, camera)
         found = dr.select(ends & ours, leaves, found)
         walking &= ~ends
         return dr.select(walking, beyond, face), walking, steps + 1, found, covers
