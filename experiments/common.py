@@ -8,8 +8,6 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 if TYPE_CHECKING:
     from collections.abc import Callable
 
@@ -84,7 +82,7 @@ class Framed:
         from appearance_opt.reference.mesh import MeshReference
         from appearance_opt.views import ViewSampler, framing
 
-        self.frame = framing(np.concatenate([m.positions for m in asset.meshes]))
+        self.frame = framing(asset.points())
         self.asset = in_frame(asset, *self.frame)
         self.reference = MeshReference(self.asset)
         self.sampler = ViewSampler((0.0, 0.0, 0.0), 1.0, seed, hull=support(self.reference.merged.positions))

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from appearance_opt.asset.normals import weld
+from appearance_opt.asset.origin import settle
 from appearance_opt.asset.paths import read_bytes
 from appearance_opt.asset.types import Asset, Material, Mesh, srgb_to_linear
 from appearance_opt.errors import InputError
@@ -31,7 +32,7 @@ def load_geometry(path: Path) -> Asset:
         raise InputError(f"{path}: not a readable {kind.upper()} file ({type(error).__name__})") from error
     if not isinstance(loaded, trimesh.Trimesh) or not len(loaded.faces):
         raise InputError(f"{path}: there are no triangles in it")
-    positions = np.asarray(loaded.vertices, np.float32)
+    positions = np.asarray(loaded.vertices, np.float64)
     faces = np.asarray(loaded.faces, np.int32)
     colors = None
     if loaded.visual.kind == "vertex":
@@ -39,8 +40,10 @@ def load_geometry(path: Path) -> Asset:
     if kind == "stl":
         first, place = weld(positions)
         positions, faces, colors = positions[first], place[faces].astype(np.int32), None
-    mesh = Mesh(positions, faces, colors=colors, material=Material(name=path.stem, roughness=0.8), name=path.stem)
-    return Asset((mesh,), path.stem, tuple(notes))
+    material = Material(name=path.stem, roughness=0.8)
+    mesh = Mesh(positions, faces, colors=colors, material=material, name=path.stem)  # type: ignore[arg-type]
+    meshes, origin = settle([mesh], notes.append)
+    return Asset(tuple(meshes), path.stem, tuple(notes), origin=origin)
 
 
 def _plain_ply(data: bytes, path: Path, notes: list[str]) -> bytes:

@@ -15,6 +15,7 @@ from appearance_opt.asset.gltf_materials import READ_EXTENSIONS, MaterialReader
 from appearance_opt.asset.gltf_meshopt import MESHOPT
 from appearance_opt.asset.gltf_nodes import INSTANCING, Nodes, Placement
 from appearance_opt.asset.normals import unit
+from appearance_opt.asset.origin import settle
 from appearance_opt.asset.types import Asset, Mesh
 from appearance_opt.errors import InputError
 
@@ -61,10 +62,11 @@ class _Reader:
         ):
             if self.document.items(kind):
                 self.note(what)
+        meshes, origin = settle(meshes, self.note)
         if not self.keep_layout:
             meshes = self._flat_where_needed(meshes)
         meshes = self.materials.in_one_frame(meshes, self.keep_layout)
-        return Asset(tuple(meshes), self.path.stem, self.document.companions.notes.lines())
+        return Asset(tuple(meshes), self.path.stem, self.document.companions.notes.lines(), origin=origin)
 
     def _roots(self) -> list[int]:
         """The nodes at the top of what is drawn: those of the scene that the file names, else of the
@@ -216,7 +218,7 @@ class _Source:
 
 
 def _placed(mesh: Mesh, place: Placement, name: str) -> Mesh:
-    """A mesh, still in double precision, at all its places in the world."""
+    """A mesh at all its places in the world, positions still in double precision."""
     vertices = len(mesh.positions)
     normals, tangents = mesh.normals, mesh.tangents
     if normals is not None:
@@ -227,7 +229,7 @@ def _placed(mesh: Mesh, place: Placement, name: str) -> Mesh:
         w = np.where(negative != place.mirrored(vertices)[:, None], -1, 1)
         tangents = _float(np.concatenate([_normalized(place.directions(tangents[:, :3])), w], axis=1))
     return Mesh(
-        positions=place.points(mesh.positions).astype(np.float32),
+        positions=place.points(mesh.positions),  # type: ignore[arg-type]
         faces=place.faces(mesh.faces, vertices),
         normals=normals,
         uvs=place.repeated(mesh.uvs),

@@ -64,8 +64,7 @@ class _Writer:
         self.json: dict[str, Any] = {
             "asset": {"version": "2.0", "generator": "appearance-opt"},
             "scene": 0,
-            "scenes": [{"nodes": list(range(len(asset.meshes)))}],
-            "nodes": [{"mesh": k, "name": m.name} for k, m in enumerate(asset.meshes)],
+            **_placed(asset),
             "meshes": [],
             "accessors": [],
             "bufferViews": [],
@@ -229,6 +228,17 @@ class _Writer:
             self.json.setdefault("textures", []).append(entry)
             self._pending.append((texture, space))
         return self._textures[key]
+
+
+def _placed(asset: Asset) -> dict[str, Any]:
+    """Scene and nodes: one for each mesh, below a root that brings them to the asset's origin if
+    that is not the world's."""
+    nodes: list[dict[str, Any]] = [{"mesh": k, "name": m.name} for k, m in enumerate(asset.meshes)]
+    tops = list(range(len(nodes)))
+    if any(asset.origin):
+        nodes.append({"name": asset.name, "translation": list(asset.origin), "children": tops})
+        tops = [len(nodes) - 1]
+    return {"scenes": [{"nodes": tops}], "nodes": nodes}
 
 
 def _unit(v: NDArray) -> NDArray[np.float32]:

@@ -10,6 +10,7 @@ import numpy as np
 
 from appearance_opt.asset import uv_frames
 from appearance_opt.asset.mtl import MaterialReader
+from appearance_opt.asset.origin import settle
 from appearance_opt.asset.paths import read_text
 from appearance_opt.asset.polygons import Polygons, triangulate
 from appearance_opt.asset.types import Asset, Material, Mesh, srgb_to_linear
@@ -115,8 +116,8 @@ class _Parser:
             for (name, has_uv, has_normal), polygons in self.polygons.items()
         ]
         place = uv_frames.kept if keep_layout else uv_frames.unified
-        meshes = place(meshes, self.materials.frames, self.companions.note)
-        return Asset(tuple(meshes), self.path.stem, self.companions.notes.lines())
+        meshes, origin = settle(place(meshes, self.materials.frames, self.companions.note), self.companions.note)
+        return Asset(tuple(meshes), self.path.stem, self.companions.notes.lines(), origin=origin)
 
     def _mesh(self, name: str, has_uv: bool, has_normal: bool, polygons: list[list[tuple[int, int, int]]]) -> Mesh:
         indices = np.array([c for p in polygons for c in p], np.int64)
@@ -130,7 +131,7 @@ class _Parser:
         vertices = [self.positions[i] for i in used[:, 0]]
         if any(len(v) < 3 for v in vertices):
             raise InputError(f"{self.path}: a vertex has fewer than three coordinates")
-        positions = np.array([v[:3] for v in vertices], np.float32)
+        positions = np.array([v[:3] for v in vertices], np.float64)
         index = index.ravel()
         corners, _ = triangulate(Polygons(np.array([len(p) for p in polygons]), index), positions)
         has_color = all(len(v) == 6 for v in vertices)
@@ -141,7 +142,7 @@ class _Parser:
         if any(len(v) < 3 for v in normals):
             raise InputError(f"{self.path}: a normal has fewer than three coordinates")
         return Mesh(
-            positions=positions,
+            positions=positions,  # type: ignore[arg-type]  # in double precision until they are settled
             faces=index[corners].astype(np.int32),
             normals=_unit(np.array(normals, np.float64)) if has_normal else None,
             uvs=uvs,

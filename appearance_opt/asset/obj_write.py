@@ -38,7 +38,11 @@ def save_obj(asset: Asset, path: Path) -> None:
     lines = ["# appearance-opt", f"mtllib {path.stem}.mtl"]
     start = np.ones(3, np.int64)  # of this mesh's positions, texture coordinates and normals in the whole file
     for mesh in asset.meshes:
-        lines += [f"o {' '.join(mesh.name.split())}", f"usemtl {named[id(mesh.material)]}", *_vertices(mesh)]
+        lines += [
+            f"o {' '.join(mesh.name.split())}",
+            f"usemtl {named[id(mesh.material)]}",
+            *_vertices(mesh, asset.origin),
+        ]
         # vertices are split at seams: one index serves all that a mesh has
         has = (True, mesh.uvs is not None, mesh.normals is not None)
         form = {(True, False): "{0}/{1}", (False, True): "{0}//{2}", (True, True): "{0}/{1}/{2}"}.get(has[1:], "{0}")
@@ -49,11 +53,17 @@ def save_obj(asset: Asset, path: Path) -> None:
         temporary.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
-def _vertices(mesh: Mesh) -> list[str]:
-    colors = np.empty((len(mesh.positions), 0), np.float32) if mesh.colors is None else mesh.colors[:, :3]
-    colors = linear_to_srgb(np.clip(colors, 0, 1))
-    rows = np.concatenate([mesh.positions, colors], axis=1)
-    lines = ["v " + " ".join(f"{x:.9g}" for x in row) for row in rows.tolist()]
+def _vertices(mesh: Mesh, origin: tuple[float, float, float]) -> list[str]:
+    """What faces refer to. Positions are those of the world: the format knows no other."""
+    form = "{:.9g} {:.9g} {:.9g}"
+    if any(origin):  # as many decimals as positions relative to the origin have
+        decimals = 8 - int(np.floor(np.log10(max(float(np.abs(mesh.positions).max()), 1e-30))))
+        form = " ".join([f"{{:.{max(decimals, 0)}f}}"] * 3)
+    positions = mesh.positions.astype(np.float64) + origin
+    lines = ["v " + form.format(*row) for row in positions.tolist()]
+    if mesh.colors is not None:
+        encoded = linear_to_srgb(np.clip(mesh.colors[:, :3], 0, 1)).tolist()
+        lines = [f"{line} {r:.9g} {g:.9g} {b:.9g}" for line, (r, g, b) in zip(lines, encoded, strict=True)]
     if mesh.uvs is not None:
         lines += [f"vt {u:.9g} {1 - v:.9g}" for u, v in mesh.uvs.tolist()]
     if mesh.normals is not None:

@@ -146,23 +146,30 @@ class Mesh:
 @dataclass(frozen=True)
 class Asset:
     """All meshes of one file, node transforms applied. ``notes`` lists, one line each, what the
-    loader dropped, repaired or assumed; ``files``, absolute paths of the files that it refers to."""
+    loader dropped, repaired or assumed; ``files``, absolute paths of the files that it refers to;
+    ``origin``: the place of the meshes in the world, which is origin + positions (metres, double
+    precision), zero but for what lies far away for its size."""
 
     meshes: tuple[Mesh, ...]
     name: str = "asset"
     notes: tuple[str, ...] = ()
     files: tuple[Path, ...] = ()
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     @property
     def triangle_count(self) -> int:
         return sum(len(m.faces) for m in self.meshes)
 
     def bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Corners (3,), (3,) of the axis-aligned box around all referenced vertices."""
+        """Corners (3,), (3,) of the axis-aligned box around all referenced vertices, in the world."""
         used = [m.positions[np.unique(m.faces)] for m in self.meshes if len(m.faces)]
         low = np.min([p.min(axis=0) for p in used], axis=0).astype(np.float64)
         high = np.max([p.max(axis=0) for p in used], axis=0).astype(np.float64)
-        return low, high
+        return low + self.origin, high + self.origin
+
+    def points(self) -> NDArray[np.float64]:
+        """(N, 3) all vertices, in the world."""
+        return np.concatenate([m.positions for m in self.meshes]).astype(np.float64) + self.origin
 
 
 def srgb_to_linear(x: NDArray) -> NDArray:

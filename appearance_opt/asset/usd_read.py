@@ -11,6 +11,7 @@ import numpy as np
 
 from appearance_opt.asset import usd_shapes
 from appearance_opt.asset.companions import Companions
+from appearance_opt.asset.origin import settle
 from appearance_opt.asset.paths import check_inside, read_bytes
 from appearance_opt.asset.polygons import Polygons, triangulate
 from appearance_opt.asset.subdivide import Sharpness, catmull_clark
@@ -135,7 +136,8 @@ class _Reader:
                 if geometry is not None:
                     meshes += self._split(prim, geometry, self._to_world(prim))
         meshes = self.materials.in_one_frame(meshes, keep_layout)
-        return Asset(tuple(meshes), self.path.stem, self.companions.notes.lines())
+        meshes, origin = settle(meshes, self.note)
+        return Asset(tuple(meshes), self.path.stem, self.companions.notes.lines(), origin=origin)
 
     def _to_world(self, prim: Any) -> Any:
         """From a mesh's own frame to the world. A skinned one is kept at its bind pose, where its own transform does
@@ -328,7 +330,7 @@ class _Reader:
                 normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
             meshes.append(
                 Mesh(
-                    positions=(got["points"] @ linear + offset).astype(np.float32),
+                    positions=got["points"] @ linear + offset,  # in double precision until settled
                     faces=index.reshape(-1, 3).astype(np.int32),
                     normals=None if normals is None else normals.astype(np.float32),
                     uvs=got["uvs"].astype(np.float32) if "uvs" in got else None,

@@ -57,7 +57,7 @@ def save_usd(asset: Asset, path: Path) -> None:
 
 
 def _write_stage(asset: Asset, root: Path, textures: str) -> None:
-    from pxr import Kind, Tf, Usd, UsdGeom
+    from pxr import Gf, Kind, Tf, Usd, UsdGeom
 
     stage = Usd.Stage.CreateNew(str(root))
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
@@ -66,6 +66,8 @@ def _write_stage(asset: Asset, root: Path, textures: str) -> None:
     top = UsdGeom.Xform.Define(stage, f"/{name}")
     stage.SetDefaultPrim(top.GetPrim())
     Usd.ModelAPI(top.GetPrim()).SetKind(Kind.Tokens.component)
+    if any(asset.origin):
+        top.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Vec3d(*asset.origin))
     UsdGeom.Scope.Define(stage, f"/{name}/Materials")
     materials: dict[tuple[int, bool], Any] = {}
     for k, mesh in enumerate(asset.meshes):

@@ -30,12 +30,16 @@ def align(moving: Asset, still: Asset) -> tuple[Asset, float, NDArray[np.float64
     """
     from scipy.spatial import cKDTree
 
-    (a0, a1), (b0, b1) = moving.bounds(), still.bounds()
+    origin = np.array(still.origin)
+    moving_origin = np.array(moving.origin) - origin
+    # near the still one, where numbers are small
+    (a0, a1), (b0, b1) = (np.array(asset.bounds()) - origin for asset in (moving, still))
     scale = float(np.linalg.norm(b1 - b0) / max(np.linalg.norm(a1 - a0), 1e-300))
     shift = (b0 + b1) / 2 - scale * (a0 + a1) / 2
     size = float(np.linalg.norm(b1 - b0))
     target, _ = _surface_points(still, POINTS, 1)
     source, normals = _surface_points(moving, DENSE, 2)
+    source = source + moving_origin
     tree = cKDTree(source)
     for _ in range(ITERATIONS):
         distance, nearest = tree.query((target - shift) / scale)
@@ -51,9 +55,10 @@ def align(moving: Asset, still: Asset) -> tuple[Asset, float, NDArray[np.float64
         scale *= 1 + growth
         if np.abs(step).max() < 1e-9:
             break
-    placed = [(m.positions.astype(np.float64) * scale + shift).astype(np.float32) for m in moving.meshes]
+    points = [(m.positions.astype(np.float64) + moving_origin) * scale + shift for m in moving.meshes]
+    placed = [p.astype(np.float32) for p in points]
     meshes = tuple(replace(m, positions=p) for m, p in zip(moving.meshes, placed, strict=True))
-    return replace(moving, meshes=meshes), scale, shift
+    return replace(moving, meshes=meshes, origin=still.origin), scale, shift + (1 - scale) * origin
 
 
 def _surface_points(asset: Asset, count: int, seed: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -131,9 +131,9 @@ class BakeJob:
         if not options.unwrap:
             check.check_overlap(self.low.mesh, name)
         watch.lap("check")
-        self.frame = framing(np.concatenate([m.positions for a in (self.high, low) for m in a.meshes]))
+        self.frame = framing(np.concatenate([self.high.points(), low.points()]))
         self.reference = MeshReference(in_frame(self.high, *self.frame))
-        self.mesh = moved(self.low.mesh, np.array(self.frame[0]), self.frame[1])
+        self.mesh = moved(self.low.mesh, np.array(self.frame[0]) - low.origin, self.frame[1])
         hull = support(self.reference.merged.positions)
         self.sampler = ViewSampler((0.0, 0.0, 0.0), 1.0, options.seed, hull=hull, light=options.light)
         watch.lap("reference")

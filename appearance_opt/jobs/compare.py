@@ -67,9 +67,9 @@ def compare(
     from appearance_opt.jobs.simplify import in_frame, support
     from appearance_opt.views import MEASURED, ViewSampler, framing
 
-    points = np.concatenate([m.positions for a in (first, second) for m in a.meshes])
+    points = np.concatenate([first.points(), second.points()])
     frame = framing(points)
-    hull = support(((points.astype(np.float64) - np.array(frame[0])) / frame[1]).astype(np.float32))
+    hull = support(((points - np.array(frame[0])) / frame[1]).astype(np.float32))
     sampler = ViewSampler((0.0, 0.0, 0.0), 1.0, seed, stream=MEASURED, hull=hull)
     result = compare_in_frame(in_frame(first, *frame), in_frame(second, *frame), sampler, views, resolution, samples)
     if out is not None:

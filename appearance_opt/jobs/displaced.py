@@ -26,6 +26,7 @@ from appearance_opt.latent.texels import TexelCodec
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from appearance_opt.asset.origin import Origin
     from appearance_opt.asset.types import Asset
     from appearance_opt.config import CommonOptions
     from appearance_opt.fit.model import Model
@@ -126,10 +127,12 @@ def without_outliers(heights: NDArray[np.float32], tolerance: float) -> NDArray[
 
 
 class Exporter:
-    """Assets of a displaced model, in the place and scale of the input."""
+    """Assets of a displaced model, in the place and scale of the input, relative to its ``origin``.
+    ``centre``, in the world, and ``scale``: of the frame in which the model was fitted."""
 
-    def __init__(self, centre: NDArray, scale: float, name: str, double_sided: bool) -> None:
-        self.centre, self.scale, self.name, self.double_sided = centre, scale, name, double_sided
+    def __init__(self, centre: Origin, scale: float, origin: Origin, name: str, double_sided: bool) -> None:
+        self.centre, self.scale = np.array(centre) - np.array(origin), scale
+        self.origin, self.name, self.double_sided = origin, name, double_sided
 
     def base(self, model: Model, maps: dict) -> Asset:
         """The base mesh, its maps, and the displacement map in metres."""
@@ -147,7 +150,7 @@ class Exporter:
 
     def _asset(self, mesh: LatentMesh, positions: NDArray, maps: dict, name: str) -> Asset:
         placed = positions.astype(np.float64) * self.scale + self.centre
-        return to_asset(mesh, placed, maps, name, self.double_sided)
+        return replace(to_asset(mesh, placed, maps, name, self.double_sided), origin=self.origin)
 
 
 def write_levels(tessellated: dict[int, Asset], out: Path) -> None:

@@ -6,8 +6,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from appearance_opt.asset import save
 from appearance_opt.jobs.paths import check_paths, check_replaces
 from appearance_opt.jobs.simplify import SimplifyResult, loaded
@@ -98,7 +96,7 @@ def _fitted(
         with_report=with_report,
     )
     double_sided = any(m.material.double_sided for m in light.meshes)
-    exporter = Exporter(np.array(job.frame[0]), job.frame[1], light.name, double_sided)
+    exporter = Exporter(*job.frame, light.origin, light.name, double_sided)
     initial = Model(mesh, start.maps, frozenset(), Rates(), start.levels[-1:])
     final = clean_maps(model, start.known)
     if options.wants("emission"):

@@ -13,6 +13,7 @@ import numpy as np
 
 from appearance_opt import __version__, backend
 from appearance_opt.asset import load, save
+from appearance_opt.asset.origin import ZERO
 from appearance_opt.asset.types import Texture
 from appearance_opt.config import CommonOptions, SimplifyOptions, as_dict, with_values
 from appearance_opt.errors import DivergedError, InputError
@@ -142,8 +143,7 @@ class _Job:
 
         self.options, self.watch = options, watch
         self.progress, self.checkpointer, self.with_report = progress, checkpointer, with_report
-        points = np.concatenate([m.positions for m in asset.meshes])
-        self.frame = framing(points)
+        self.frame = framing(asset.points())
         # the fit works on an object of radius 1 around the origin, so that no threshold in it and no
         # digit of a float depends on the scale and place of the input
         self.reference = MeshReference(in_frame(asset, *self.frame))
@@ -224,7 +224,7 @@ class _Job:
         )
         name = f"{self.asset.name}_{len(self.start.mesh.faces)}"
         double_sided = any(m.material.double_sided for m in self.asset.meshes)
-        exporter = Exporter(np.array(self.frame[0]), self.frame[1], name, double_sided)
+        exporter = Exporter(*self.frame, self.asset.origin, name, double_sided)
         initial = Model(self.start.mesh, self.start.maps, frozenset(), Rates(), self.start.levels[-1:])
         begin = exporter.drawn(initial, self.start.maps)[initial.level]
         maps = clean_maps(model, self.start.known)
@@ -245,12 +245,14 @@ class _Job:
 
 
 def in_frame(asset: Asset, centre: tuple[float, float, float], scale: float) -> Asset:
-    """The asset moved by -centre and divided by scale (computed in double precision)."""
-    c = np.asarray(centre)
+    """The asset moved by -centre and divided by scale (computed in double precision). ``centre``: in
+    the world; the result has no origin of its own."""
+    offset = np.array(asset.origin) - np.array(centre)
     moved = [
-        replace(m, positions=((m.positions.astype(np.float64) - c) / scale).astype(np.float32)) for m in asset.meshes
+        replace(m, positions=((m.positions.astype(np.float64) + offset) / scale).astype(np.float32))
+        for m in asset.meshes
     ]
-    return replace(asset, meshes=tuple(moved))
+    return replace(asset, meshes=tuple(moved), origin=ZERO)
 
 
 def support(positions: NDArray, count: int = 256) -> NDArray[np.float64]:
@@ -277,8 +279,8 @@ def _checkpointer(
 
 
 def _fingerprint(asset: Asset, options: SimplifyOptions) -> str:
-    """Hash of all that a result depends on: options, version, every array of every mesh, every field of every
-    material."""
+    """Hash of all that a result depends on: options, version, origin, every array of every mesh, every
+    field of every material."""
     digest = hashlib.sha256(json.dumps([__version__, as_dict(options)], sort_keys=True).encode())
 
     def add(value: object) -> None:
@@ -291,6 +293,7 @@ def _fingerprint(asset: Asset, options: SimplifyOptions) -> str:
         else:
             digest.update(repr(value).encode())
 
+    add(asset.origin)
     for mesh in asset.meshes:
         for name in ("positions", "faces", "normals", "uvs", "tangents", "colors"):
             add(getattr(mesh, name))

@@ -220,4 +220,5 @@ def loaded_mesh(
     centre, scale = frame
     faces = place[f].astype(np.int32)
     require_memory(len(faces), options)
-    return unwrap((p[first] - np.array(centre)) / scale, faces, options.texture_size, gutter(len(faces), options))
+    offset = np.array(asset.origin) - np.array(centre)
+    return unwrap((p[first] + offset) / scale, faces, options.texture_size, gutter(len(faces), options))

@@ -36,7 +36,7 @@ def compare(path: Path, resolution: int = 256, normal_maps: bool = False) -> Com
     smooth tangents. Its frames are right-handed: faces with mirrored coordinates get a map with the green turned
     over."""
     asset = load(path)
-    frame = framing(np.concatenate([m.positions for m in asset.meshes]))
+    frame = framing(asset.points())
     asset = in_frame(asset, *frame)
     if not normal_maps:
         asset = _plain(asset)

@@ -18,7 +18,7 @@ def set_up(latent: int, reference: int, maps: int, room: float = 1.0) -> tuple[M
     """A bumpy sphere, and a smooth coarse one with random maps as its latent. ``latent``, ``reference``: triangles;
     ``room``: width of a view in units of one that the sphere fills."""
     asset = bumpy_sphere(reference)
-    frame = framing(np.concatenate([m.positions for m in asset.meshes]))
+    frame = framing(asset.points())
     source = MeshReference(in_frame(asset, *frame))
     mesh = sphere(latent, (0.0, 0.0, 0.0), 0.93, maps)
     model = Model(mesh, random_maps(maps, 0, True), frozenset(("shape", "normal", "material")), Rates())

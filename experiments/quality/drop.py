@@ -46,7 +46,7 @@ def blender_result(python: str, reference: Path, triangles: int, stem: Path) -> 
     here = Path(__file__).parent
     command = [python, str(here / "blender_simplify.py"), str(reference), str(triangles), str(low)]
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
-    _, radius = framing(np.concatenate([m.positions for m in load(reference).meshes]))
+    _, radius = framing(load(reference).points())
     bake = here.parent / "baking" / "blender_bake.py"
     command = [python, str(bake), str(reference), str(low), str(maps), str(SIZE), str(REACH * radius), "4"]
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
