@@ -36,9 +36,9 @@ def settle(meshes: Sequence[Mesh], note: Callable[[str], None]) -> tuple[list[Me
 
     ``meshes``: with positions of the world in double precision. ``note``: told of an origin. It is
     zero unless single precision would round the world's positions by more than ``SHARE`` of the
-    asset's longest side. Otherwise it is the centre of the box around what faces use, rounded to a multiple of a power of
-    two near the asset's size, so that programs which keep the place of a node in single precision
-    move the asset by as little as possible.
+    asset's longest side. Otherwise it is the centre of the box around what faces use, rounded to a
+    multiple of a power of two near the asset's size, so that programs which keep the place of a
+    node in single precision move the asset by as little as possible.
     """
     origin = _origin_of(_boxes(meshes))
     if any(origin):
