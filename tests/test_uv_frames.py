@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ import pytest
 
 from appearance_opt.asset import Asset, load
 from appearance_opt.asset.images import encode_png
+from appearance_opt.asset.uv_frames import bilinear
 from tests.test_asset_gltf import write_glb
 
 WRAPS = {"repeat": 10497, "clamp": 33071, "mirror": 33648}
@@ -151,3 +153,103 @@ def test_what_would_be_too_large_is_left_with_a_note(tmp_path: Path) -> None:
     asset = quad(tmp_path / "quad.glb", textures, 0.0, 10_000.0)
     assert any("too large to be resampled: the first one's are used" in note for note in asset.notes)
     assert asset.meshes[0].uvs.max() == 10_000
+
+
+def two_sets(path: Path, color: np.ndarray, orm: np.ndarray, normal: np.ndarray | None, second) -> Asset:
+    """A grid over the unit square in x and y, its first texture coordinates (x, 1 - y). Base colour and normal map read
+    the second ones, which are ``second`` of the first; roughness and metalness the first."""
+    side = np.linspace(0, 1, 9)
+    x, y = (c.ravel() for c in np.meshgrid(side, side))
+    index = np.arange(81).reshape(9, 9)
+    a, b, c, d = index[:-1, :-1].ravel(), index[:-1, 1:].ravel(), index[1:, 1:].ravel(), index[1:, :-1].ravel()
+    faces = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)]).astype(np.uint16)
+    first = np.stack([x, 1 - y], 1).astype(np.float32)
+    positions = np.stack([x, y, 0 * x], 1).astype(np.float32)
+    normals = np.broadcast_to(np.float32([0, 0, 1]), positions.shape)
+    pictures = [color, orm, *([] if normal is None else [normal])]
+    parts = [positions, normals, first, second(first).astype(np.float32), faces]
+    chunks = [np.ascontiguousarray(p).tobytes() for p in parts] + [encode_png(p) for p in pictures]
+    views, binary = [], b""
+    for chunk in chunks:
+        views.append({"buffer": 0, "byteOffset": len(binary), "byteLength": len(chunk)})
+        binary += chunk + b"\0" * (-len(chunk) % 4)
+    pbr = {"baseColorTexture": {"index": 0, "texCoord": 1}, "metallicRoughnessTexture": {"index": 1}}
+    material = {
+        "pbrMetallicRoughness": pbr,
+        **({} if normal is None else {"normalTexture": {"index": 2, "texCoord": 1}}),
+    }
+    kinds = ((5126, "VEC3", 81), (5126, "VEC3", 81), (5126, "VEC2", 81), (5126, "VEC2", 81), (5123, "SCALAR", 384))
+    attributes = {"POSITION": 0, "NORMAL": 1, "TEXCOORD_0": 2, "TEXCOORD_1": 3}
+    document = {
+        "asset": {"version": "2.0"},
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [{"attributes": attributes, "indices": 4, "material": 0}]}],
+        "accessors": [
+            {"bufferView": k, "componentType": t, "count": n, "type": kind} for k, (t, kind, n) in enumerate(kinds)
+        ],
+        "materials": [material],
+        "textures": [{"source": k} for k in range(len(pictures))],
+        "images": [{"bufferView": 5 + k, "mimeType": "image/png"} for k in range(len(pictures))],
+        "bufferViews": views,
+        "buffers": [{"byteLength": len(binary)}],
+    }
+    write_glb(path, document, binary)
+    return load(path)
+
+
+def smooth(size: int, across: int) -> np.ndarray:
+    """A picture that repeats itself, without edges."""
+    at = (np.arange(size) + 0.5) / size * 2 * np.pi
+    wave = 127.5 + 100 * np.sin(across * at)[None, :] * np.cos(at)[:, None]
+    return np.repeat(np.rint(wave)[..., None], 3, axis=2).astype(np.uint8)
+
+
+def read_at(texture, uvs: np.ndarray) -> np.ndarray:
+    return bilinear(texture, np.asarray(uvs, np.float64))
+
+
+@pytest.mark.parametrize("scale", [(1.0, 1.0), (2.0, 1.0), (0.5, 3.0)])
+def test_textures_of_two_sets_of_coordinates_are_brought_into_one(tmp_path: Path, scale: tuple[float, float]) -> None:
+    color, orm = smooth(64, 2), smooth(64, 1)
+    second = lambda uv: uv[:, ::-1] * scale + (0.25, 0.125)  # noqa: E731
+    asset = two_sets(tmp_path / "x.glb", color, orm, None, second)
+    mesh = asset.meshes[0]
+    assert mesh.uvs is not None and mesh.uvs.shape[1] == 2
+    first = np.stack([mesh.positions[:, 0], 1 - mesh.positions[:, 1]], axis=1)
+    material = mesh.material
+    # a face's middle, where the coordinates are the means of its corners'
+    middle = lambda uv: np.asarray(uv)[mesh.faces].mean(axis=1)  # noqa: E731
+    for texture, pixels, at in (
+        (material.base_color_texture, color, second(first)),
+        (material.orm_texture, orm, first),
+    ):
+        want = read_at(replace(texture, pixels=pixels, wrap=("repeat", "repeat")), middle(at))
+        got = read_at(texture, middle(mesh.uvs))
+        assert np.abs(got - want).max() < 6  # of 255: twice interpolated, and rounded
+    assert [n for n in asset.notes if "resampled to one set" in n and "base color" in n and "orm" in n]
+
+
+def test_the_normal_map_turns_with_the_coordinates_it_is_drawn_into(tmp_path: Path) -> None:
+    """All faces lie over each other in the second set, which cannot lead; there u runs up and v to the right."""
+    color, orm = smooth(64, 1), smooth(64, 1)
+    tilted = np.full((8, 8, 3), (230, 128, 200), np.uint8)  # towards the second set's u: up, +y
+    second = lambda uv: np.stack([np.round(8 * (1 - uv[:, 1])) % 2, np.round(8 * uv[:, 0]) % 2], axis=1)  # noqa: E731
+    asset = two_sets(tmp_path / "x.glb", color, orm, tilted, second)
+    mesh = asset.meshes[0]
+    normal = mesh.material.normal_texture
+    assert normal is not None
+    n = read_at(normal, np.asarray(mesh.uvs)[mesh.faces].mean(axis=1)) / 255 * 2 - 1
+    # the coordinates go up and down in turns: the normals lie along y, and none along x
+    assert np.abs(n[:, 0]).max() < 0.03
+    np.testing.assert_allclose(np.abs(n[:, 1]), 0.8, atol=0.03)
+    assert {-1.0, 1.0} == set(np.sign(n[:, 1]))
+
+
+def test_a_second_set_that_repeats_the_first_costs_nothing(tmp_path: Path) -> None:
+    color, orm = smooth(16, 1), smooth(16, 2)
+    asset = two_sets(tmp_path / "x.glb", color, orm, None, lambda uv: uv)
+    material = asset.meshes[0].material
+    assert material.base_color_texture is not None
+    np.testing.assert_array_equal(material.base_color_texture.pixels, color)
+    assert not [n for n in asset.notes if "resampled" in n]

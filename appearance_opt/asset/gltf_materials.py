@@ -3,24 +3,29 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from appearance_opt.asset import images, specular_glossiness, uv_frames
+from appearance_opt.asset import images, specular_glossiness, udim, uv_frames
 from appearance_opt.asset.packing import with_occlusion
 from appearance_opt.asset.types import Material, Mesh, Texture, Volume, Wrap
 from appearance_opt.errors import InputError
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from numpy.typing import NDArray
 
     from appearance_opt.asset.gltf_accessors import Document
+    from appearance_opt.asset.udim import Tile
 
 STRENGTH = "KHR_materials_emissive_strength"
 SPECULAR = "KHR_materials_pbrSpecularGlossiness"
 VARIANTS = "KHR_materials_variants"
 TRANSMISSION, VOLUME, IOR = (f"KHR_materials_{name}" for name in ("transmission", "volume", "ior"))
 _TRANSPARENT = (TRANSMISSION, VOLUME, IOR)
-READ_EXTENSIONS = (STRENGTH, SPECULAR, *_TRANSPARENT, VARIANTS, "KHR_texture_transform", "EXT_texture_webp")
+_IMAGES = ("EXT_texture_webp", "KHR_texture_basisu")
+READ_EXTENSIONS = (STRENGTH, SPECULAR, *_TRANSPARENT, VARIANTS, "KHR_texture_transform", *_IMAGES)
 """Extensions of materials and textures that are heeded."""
 
 _WRAPS: dict[int, Wrap] = {10497: "repeat", 33071: "clamp", 33648: "mirror"}
@@ -34,7 +39,10 @@ class MaterialReader:
         self.document, self.path = document, document.path
         self.note = document.companions.note
         self._images: dict[int, NDArray | None] = {}
-        self._materials: dict[int | None, tuple[Material, int]] = {}
+        self._materials: dict[int | None, tuple[Material, list[int]]] = {}
+        self._frames: dict[int, dict[str, uv_frames.Frame]] = {}
+        self._tiles: dict[int, Callable[[Tile], Material]] = {}
+        self._tile: Tile | None = None  # the one that is read
         self._variant = self._number(variant)
 
     def _number(self, variant: str | None) -> int | None:
@@ -55,31 +63,40 @@ class MaterialReader:
                 return mapping["material"]
         return primitive.get("material")
 
-    def read(self, index: int | None) -> tuple[Material, int]:
-        """(material, index of the texture coordinates that its textures use)."""
+    def read(self, index: int | None) -> tuple[Material, list[int]]:
+        """(material, numbers of the sets of texture coordinates that its textures read)."""
         if index not in self._materials:
-            infos = self._texture_infos(index)
-            channels = [
-                i.get("extensions", {}).get("KHR_texture_transform", {}).get("texCoord", i.get("texCoord", 0))
-                for i in infos.values()
-            ]
-            if len(set(channels)) > 1:
-                self.note("textures of one material use different texture coordinates: the first set is used for all")
-            material = Material() if index is None else self._read_material(index)
-            self._materials[index] = material, channels[0] if channels else 0
+            self._materials[index] = self._place(index), self._sets(index)
         return self._materials[index]
 
     def in_one_frame(self, meshes: list[Mesh], keep_layout: bool = False) -> list[Mesh]:
-        """KHR_texture_transform applied, and textures brought under one transform and wrap mode where they differ;
-        or all as it is (``keep_layout``: see ``asset.load``)."""
-        frames_of = {}
-        for index, (material, _) in self._materials.items():
-            extensions = {n: info.get("extensions", {}) for n, info in self._texture_infos(index).items()}
-            frames_of[id(material)] = {
-                n: uv_frames.affine(e.get("KHR_texture_transform")) for n, e in extensions.items()
-            }
-        place = uv_frames.kept if keep_layout else uv_frames.unified
-        return place(meshes, frames_of, self.note)
+        """The meshes as their textures read them; see ``uv_frames.placed``."""
+        return uv_frames.placed(meshes, self._frames, self.note, self._tiles, keep_layout)
+
+    def _place(self, index: int | None, tile: Tile | None = None) -> Material:
+        """A material, of one tile of its textures if it has some in tiles; where they read is remembered."""
+        infos = self._texture_infos(index)
+        self._tile = tile
+        material = Material() if index is None else self._read_material(index)
+        self._tile = None
+        sets = self._sets(index)
+        self._frames[id(material)] = {
+            n: uv_frames.Frame(uv_frames.affine(_transform(info)), sets.index(_coordinates(info)))
+            for n, info in infos.items()
+        }
+        if tile is None and any(self._tiled_name(info) for info in infos.values()):
+            self._tiles[id(material)] = partial(self._place, index)
+        return material
+
+    def _sets(self, index: int | None) -> list[int]:
+        """Numbers of the sets of texture coordinates that the textures of a material read."""
+        return list(dict.fromkeys(_coordinates(i) for i in self._texture_infos(index).values())) or [0]
+
+    def _tiled_name(self, info: dict[str, Any]) -> str | None:
+        """The name of a texture in tiles, which glTF does not have, but some files."""
+        source = _source(self.document.items("textures")[info["index"]])
+        uri = "" if source is None else str(self.document.items("images")[source].get("uri", ""))
+        return uri if not uri.startswith("data:") and udim.is_tiled(uri) else None
 
     def _texture_infos(self, index: int | None) -> dict[str, dict[str, Any]]:
         """What a material says of its textures, by the name of ours."""
@@ -212,18 +229,30 @@ class MaterialReader:
         if info is None:
             return None
         texture = self.document.items("textures")[info["index"]]
-        webp = texture.get("extensions", {}).get("EXT_texture_webp", {})
-        source = texture.get("source", webp.get("source"))
+        source = _source(texture)
         if source is None:
             raise InputError(f"{self.path}: a texture of material '{material}' has no image in a supported format")
-        if source not in self._images:
-            self._images[source] = self.document.companions.read(lambda: self._image(source, material))
+        name = self._tiled_name(info)
+        if name is not None:
+            pixels = self._read_tile(name)
+        else:
+            if source not in self._images:
+                self._images[source] = self.document.companions.read(lambda: self._image(source, material))
+            pixels = self._images[source]
         sampler = self.document.items("samplers")[texture["sampler"]] if "sampler" in texture else {}
         wrap = (_WRAPS.get(sampler.get("wrapS", 0), "repeat"), _WRAPS.get(sampler.get("wrapT", 0), "repeat"))
-        pixels = self._images[source]
         if pixels is None:
             return None
-        return Texture(images.colored(pixels), space, wrap)  # type: ignore[arg-type]
+        read = Texture(images.colored(pixels), space, wrap)  # type: ignore[arg-type]
+        return read if name is None or self._tile is None else udim.fitted(read, self._tile, self.note)
+
+    def _read_tile(self, name: str) -> NDArray | None:
+        companions = self.document.companions
+        if self._tile is None:
+            return None
+        return udim.read_tile(
+            name, self._tile, self.path, companions, lambda file: images.read(companions.find(file, self.path))
+        )
 
     def _image(self, index: int, material: str) -> NDArray:
         image = self.document.items("images")[index]
@@ -234,11 +263,25 @@ class MaterialReader:
         return images.decode(data, f"{self.path}, image {image.get('name') or index} of material '{material}'")
 
 
+def _source(texture: dict[str, Any]) -> int | None:
+    """The image of a texture: the plain one, if there is one, beside those that extensions name."""
+    others = (e.get("source") for n, e in texture.get("extensions", {}).items() if n in _IMAGES)
+    return texture.get("source", next((s for s in others if s is not None), None))
+
+
+def _transform(info: dict[str, Any]) -> dict[str, Any] | None:
+    return info.get("extensions", {}).get("KHR_texture_transform")
+
+
+def _coordinates(info: dict[str, Any]) -> int:
+    """Number of the set of texture coordinates that a texture reads."""
+    return (_transform(info) or {}).get("texCoord", info.get("texCoord", 0))
+
+
 def _quoted(names: list[str]) -> str:
     return ", ".join(f"'{n}'" for n in names)
 
 
 def _place(info: dict[str, Any]) -> tuple[int, str]:
     """Which texture coordinates a texture uses, and where it lies in them."""
-    transform = info.get("extensions", {}).get("KHR_texture_transform", {})
-    return transform.get("texCoord", info.get("texCoord", 0)), str(sorted(transform.items()))
+    return _coordinates(info), str(sorted((_transform(info) or {}).items()))

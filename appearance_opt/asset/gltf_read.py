@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from appearance_opt.asset import uv_frames
 from appearance_opt.asset.batch import Batch
 from appearance_opt.asset.gltf_accessors import Document
 from appearance_opt.asset.gltf_draco import DRACO, Compressed
@@ -26,7 +27,6 @@ if TYPE_CHECKING:
 
     from appearance_opt.asset.companions import Companions
 
-_COMPRESSED = {"KHR_texture_basisu": "Basis Universal"}
 _READ = {DRACO, *MESHOPT, INSTANCING, "KHR_mesh_quantization", *READ_EXTENSIONS}
 _VISUAL = ("KHR_materials_", "KHR_lights_", "EXT_lights_", "KHR_animation_pointer", "KHR_xmp_json_ld")
 """Extensions, by the start of their names, without which shapes and textures are the same: lobes of materials, and
@@ -83,10 +83,6 @@ class _Reader:
 
     def _check_extensions(self) -> None:
         for name in self.document.json.get("extensionsRequired", []):
-            if name in _COMPRESSED:
-                raise InputError(
-                    f"{self.path}: {_COMPRESSED[name]} compression is not supported; save it uncompressed first"
-                )
             if name not in _READ and not str(name).startswith(_VISUAL):
                 raise InputError(
                     f"{self.path}: requires the extension '{name}', which is not supported; save it without"
@@ -146,12 +142,13 @@ class _Reader:
         if "NORMAL" in attributes:
             normals = read("NORMAL").astype(np.float64)
             tangents = read("TANGENT").astype(np.float64) if "TANGENT" in attributes else None
-        material, channel = self.materials.read(self.materials.of(primitive))
+        material, sets = self.materials.read(self.materials.of(primitive))
         if "COLOR_0" in attributes:
             colors = read("COLOR_0").astype(np.float32)
             if material.alpha_mode == "opaque":  # their alpha means nothing
                 colors = colors[:, :3]
-        uvs = _float(read(f"TEXCOORD_{channel}")) if f"TEXCOORD_{channel}" in attributes else None
+        names = [f"TEXCOORD_{k}" for k in sets]
+        uvs = uv_frames.stacked([_float(read(n)[:, :2]) if n in attributes else None for n in names])
         positions = read("POSITION")[:, :3].astype(np.float64)
         return Mesh(positions, source.faces, normals, uvs, tangents, colors, material)  # type: ignore[arg-type]
 

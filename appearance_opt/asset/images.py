@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from appearance_opt.asset import basis
 from appearance_opt.asset.paths import read_bytes
 from appearance_opt.errors import InputError
 
@@ -27,6 +28,8 @@ def decode(data: bytes, name: str) -> NDArray:
     Raises InputError when it cannot be read."""
     if not data:
         raise InputError(f"{name}: the image is empty")
+    if basis.is_basis(data):
+        return basis.decode(data, name, MAX_SIZE)
     # the Python bindings of OpenImageIO read from and write to named files only, and the name chooses the reader:
     # one of ours, by what the data is, for a name may ask for readers that read no picture at all
     suffix = _suffix(data, name)
@@ -156,7 +159,7 @@ def _suffix(data: bytes, name: str) -> str:
             return suffix
     if len(data) > 18 and data[1] <= 1 and data[2] in _TGA_TYPES and data[16] in (8, 15, 16, 24, 32):
         return ".tga"  # it has no magic number
-    raise InputError(f"{name}: not a readable image (neither PNG, JPEG, EXR, TIFF, WebP, BMP, TGA nor HDR)")
+    raise InputError(f"{name}: not a readable image (neither PNG, JPEG, EXR, TIFF, WebP, BMP, TGA, HDR nor KTX2)")
 
 
 _TGA_TYPES = (1, 2, 3, 9, 10, 11)

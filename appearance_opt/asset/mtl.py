@@ -4,23 +4,26 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass, field
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from appearance_opt.asset import images, uv_frames
+from appearance_opt.asset import images, udim, uv_frames
 from appearance_opt.asset.packing import pack_orm, with_alpha
 from appearance_opt.asset.paths import read_text
 from appearance_opt.asset.types import Material, Texture, Wrap
 from appearance_opt.errors import InputError
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from pathlib import Path
 
     from numpy.typing import NDArray
 
     from appearance_opt.asset.companions import Companions
-    from appearance_opt.asset.types import AlphaMode, ColorSpace
+    from appearance_opt.asset.types import AlphaMode, ColorSpace, Mesh
+    from appearance_opt.asset.udim import Tile
 
 _MAP_OPTIONS = {
     "-blendu": 1, "-blendv": 1, "-boost": 1, "-mm": 2, "-o": 3, "-s": 3, "-t": 3, "-texres": 1,
@@ -66,12 +69,13 @@ class _Map:
 
 class MaterialReader:
     """Materials of the MTL files of one OBJ file: ``by_name``, and by ``id`` of a material the ``frames`` of its
-    textures (see ``uv_frames.unified``)."""
+    textures (see ``uv_frames.unified``), and what reads its ``tiles`` if they have any (see ``udim.split``)."""
 
     def __init__(self, companions: Companions) -> None:
         self.companions, self.note = companions, companions.note
         self.by_name: dict[str, Material] = {}
-        self.frames: dict[int, dict[str, NDArray[np.float64]]] = {}
+        self.frames: dict[int, dict[str, uv_frames.Frame]] = {}
+        self.tiles: dict[int, Callable[[Tile], Material]] = {}
 
     def read(self, path: Path) -> None:
         """Add the materials of a file. Raises InputError."""
@@ -90,21 +94,32 @@ class MaterialReader:
             else:
                 current[words[0].lower()] = words[1].strip()
         for name, values in statements.items():
-            try:
-                one = _Statements(name, values, path, self.companions)
-                material = one.material()
-            except (ValueError, IndexError):
-                raise InputError(f"{path}: a value of material '{name}' is missing or not a number") from None
-            self.by_name[name] = material
-            self.frames[id(material)] = one.frames
+            self.by_name[name] = self._material(name, values, path)
+            if any(udim.is_tiled(v) for v in values.values()):
+                self.tiles[id(self.by_name[name])] = partial(self._material, name, values, path)
+
+    def _material(self, name: str, values: dict[str, str], path: Path, tile: Tile | None = None) -> Material:
+        try:
+            one = _Statements(name, values, path, self.companions, tile)
+            material = one.material()
+        except (ValueError, IndexError):
+            raise InputError(f"{path}: a value of material '{name}' is missing or not a number") from None
+        self.frames[id(material)] = one.frames
+        return material
+
+    def placed(self, meshes: list[Mesh], keep_layout: bool) -> list[Mesh]:
+        """The meshes as their textures read them; see ``uv_frames.placed``."""
+        return uv_frames.placed(meshes, self.frames, self.note, self.tiles, keep_layout)
 
 
 class _Statements:
-    """The statements of one material, by lower-case key."""
+    """The statements of one material, by lower-case key; of one tile of its textures, or without those in tiles."""
 
-    def __init__(self, name: str, values: dict[str, str], path: Path, companions: Companions) -> None:
-        self.name, self.values, self.path, self.companions = name, values, path, companions
-        self.frames: dict[str, NDArray[np.float64]] = {}
+    def __init__(
+        self, name: str, values: dict[str, str], path: Path, companions: Companions, tile: Tile | None
+    ) -> None:
+        self.name, self.values, self.path, self.companions, self.tile = name, values, path, companions, tile
+        self.frames: dict[str, uv_frames.Frame] = {}
 
     def material(self) -> Material:
         """Phong exponents become roughness sqrt(2 / (Ns + 2)). Constants beside a map are ignored, for many exporters
@@ -160,15 +175,17 @@ class _Statements:
         if key not in self.values:
             return None
         given = _map(self.values[key])
-        pixels = self.companions.read(lambda: images.read(self.companions.find(given.file, self.path)))
+        pixels = self._pixels(given.file)
         if pixels is None:
+            if udim.is_tiled(given.file):
+                self.frames.setdefault(slot, uv_frames.Frame(given.frame))
             return None
         if given.ignored:
             self._note(f"{' '.join(given.ignored)} of {key} ignored")
-        if slot in self.frames and not np.allclose(self.frames[slot], given.frame):
+        if slot in self.frames and not np.allclose(self.frames[slot].matrix, given.frame):
             which = "roughness and metalness" if slot == "orm_texture" else "colour and alpha"
             self._note(f"the maps of {which} differ in transform: the first one's is used for both")
-        self.frames.setdefault(slot, given.frame)
+        self.frames.setdefault(slot, uv_frames.Frame(given.frame))
         if one_channel:
             channel = given.channel
             if channel is None:  # what is named as a map of alpha is often a picture with alpha
@@ -180,7 +197,22 @@ class _Statements:
             pixels = images.colored(pixels)
         if pixels.dtype.kind == "f":  # EXR and HDR files are linear
             space = "linear"
-        return Texture(np.ascontiguousarray(pixels), space, (given.wrap, given.wrap))
+        texture = Texture(np.ascontiguousarray(pixels), space, (given.wrap, given.wrap))
+        if self.tile is None or not udim.is_tiled(given.file):
+            return texture
+        return udim.fitted(texture, self.tile, self.companions.note)
+
+    def _pixels(self, file: str) -> NDArray | None:
+        """None if the file is missing and that is to be ignored, or if it is one in tiles and none is asked for."""
+
+        def read(name: str) -> NDArray:
+            return images.read(self.companions.find(name, self.path))
+
+        if not udim.is_tiled(file):
+            return self.companions.read(lambda: read(file))
+        if self.tile is None:
+            return None
+        return udim.read_tile(file, self.tile, self.path, self.companions, read)
 
     def _opacity(self) -> tuple[float, Texture | None]:
         """(factor, map) of alpha. The format has no alpha test: our own files keep theirs in a comment."""

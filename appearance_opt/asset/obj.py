@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from appearance_opt.asset import uv_frames
 from appearance_opt.asset.mtl import MaterialReader
 from appearance_opt.asset.origin import settle
 from appearance_opt.asset.paths import read_text
@@ -115,8 +114,7 @@ class _Parser:
             self._mesh(name, has_uv and there[0], has_normal and there[1], polygons)
             for (name, has_uv, has_normal), polygons in self.polygons.items()
         ]
-        place = uv_frames.kept if keep_layout else uv_frames.unified
-        meshes, origin = settle(place(meshes, self.materials.frames, self.companions.note), self.companions.note)
+        meshes, origin = settle(self.materials.placed(meshes, keep_layout), self.companions.note)
         return Asset(tuple(meshes), self.path.stem, self.companions.notes.lines(), origin=origin)
 
     def _mesh(self, name: str, has_uv: bool, has_normal: bool, polygons: list[list[tuple[int, int, int]]]) -> Mesh:

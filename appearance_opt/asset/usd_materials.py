@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from appearance_opt.asset import images, specular_glossiness, uv_frames
+from appearance_opt.asset import images, specular_glossiness, udim, uv_frames
 from appearance_opt.asset.materialx import load_materialx
 from appearance_opt.asset.packing import pack_orm, with_alpha
 from appearance_opt.asset.paths import check_inside
@@ -18,15 +18,18 @@ from appearance_opt.asset.types import Material, Mesh, Texture
 from appearance_opt.errors import MissingFileError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator, Mapping
 
     from numpy.typing import NDArray
 
     from appearance_opt.asset.companions import Companions
+    from appearance_opt.asset.udim import Tile
 
 _WRAPS = {"repeat": "repeat", "clamp": "clamp", "mirror": "mirror", "black": "clamp"}
 _PURPOSES = ("full", "preview", "")
 """Purposes of bindings in the order in which they are taken; the last is that for all."""
+MAX_TRANSFORMS = 16
+"""Transforms in a row before a texture's coordinates: networks may have cycles."""
 _CHANNEL = {"r": 0, "g": 1, "b": 2, "a": 3}
 
 
@@ -36,13 +39,18 @@ class MaterialReader:
     def __init__(self, stage: Any, path: Path, companions: Companions) -> None:
         self.stage, self.path, self.companions, self.note = stage, path, companions, companions.note
         self._materials: dict[str, Material] = {}
-        self.frames: dict[int, dict[str, NDArray[np.float64]]] = {}
+        self.frames: dict[int, dict[str, uv_frames.Frame]] = {}
+        self._sets: dict[int, tuple[str, ...]] = {}  # by id of a material, the primvars that its textures read
+        self.tiles: dict[int, Callable[[Tile], Material]] = {}
+        # while a material is read: the tile of its textures that is asked for, and whether it has any in tiles
+        self._tile: Tile | None = None
+        self._in_tiles = False
         self._pixels: dict[str, NDArray] = {}
         self._by_side: dict[tuple[int, bool], Material] = {}
 
-    def bindings(self, prim: Any, face_ids: NDArray) -> Iterator[tuple[Material, str, NDArray[np.bool_]]]:
-        """(material, primvar of its texture coordinates, mask of the triangles that wear it); ``face_ids``: face of the
-        file of each triangle."""
+    def bindings(self, prim: Any, face_ids: NDArray) -> Iterator[tuple[Material, list[str], NDArray[np.bool_]]]:
+        """(material, primvars of the texture coordinates that it reads, mask of the triangles that wear it);
+        ``face_ids``: face of the file of each triangle."""
         from pxr import UsdGeom
 
         double = bool(UsdGeom.Gprim(prim).GetDoubleSidedAttr().Get())
@@ -51,16 +59,16 @@ class MaterialReader:
             faces = np.array(UsdGeom.Subset(subset).GetIndicesAttr().Get() or [], np.int64)
             mask = np.isin(face_ids, faces) & rest
             rest &= ~mask
-            yield self._sided(self._bound(subset), double), self._uv_name(prim, subset), mask
+            yield self._sided(self._bound(subset), double), self._uv_names(prim, subset), mask
         if rest.any():
-            yield self._sided(self._bound(prim), double), self._uv_name(prim, prim), rest
+            yield self._sided(self._bound(prim), double), self._uv_names(prim, prim), rest
 
     def uv_names(self, prim: Any) -> list[str]:
-        """The primvars that hold texture coordinates of a mesh, of which each of its materials reads one."""
+        """The primvars that hold texture coordinates of a mesh, of which each of its materials reads some."""
         subsets = self._subsets(prim)
         wearers = [*subsets, *([prim] if not subsets or self._bound_prim(prim) else [])]
-        names = list(dict.fromkeys(self._uv_name(prim, w) for w in wearers))
-        if len(names) > 1:
+        names = list(dict.fromkeys(name for w in wearers for name in self._uv_names(prim, w)))
+        if len(names) > 1 and len(wearers) > 1:
             self.note(f"'{prim.GetPath()}': its materials read texture coordinates of their own ({', '.join(names)})")
         return names
 
@@ -69,23 +77,15 @@ class MaterialReader:
 
         return [s.GetPrim() for s in UsdShade.MaterialBindingAPI(prim).GetMaterialBindSubsets()]
 
-    def _uv_name(self, prim: Any, wearer: Any) -> str:
-        """What the material of ``wearer``, a mesh or a subset of it, reads, or the usual names."""
-        from pxr import UsdGeom, UsdShade
+    def _uv_names(self, prim: Any, wearer: Any) -> list[str]:
+        """The primvars that the material of ``wearer``, a mesh or a subset of it, reads, in the order of its sets; the
+        usual one for each that the mesh does not have."""
+        from pxr import UsdGeom
 
-        names = []
-        material = self._bound_prim(wearer)
-        if material:
-            for node in _descendants(material.GetPrim()):
-                shader = UsdShade.Shader(node)
-                if shader and str(shader.GetIdAttr().Get() or "").startswith("UsdPrimvarReader_float2"):
-                    names.append(str(_value(shader.GetInput("varname")) or ""))
         api = UsdGeom.PrimvarsAPI(prim)
-        read = [n for n in dict.fromkeys(names) if n and api.HasPrimvar(n)]
-        if len(read) > 1:
-            told = "use different texture coordinates: the first set is used for all"
-            self.note(f"material '{material.GetPrim().GetName()}': its textures {told}")
-        return next((n for n in (*read, "st", "UVMap", "map1", "uv") if api.HasPrimvar(n)), "st")
+        usual = next((n for n in ("st", "UVMap", "map1", "uv") if api.HasPrimvar(n)), "st")
+        read = self._sets.get(id(self._bound(wearer)), ())
+        return [n if api.HasPrimvar(n) else usual for n in read] or [usual]
 
     def uses_display_color(self, prim: Any) -> bool:
         """Is displayColor what colours the mesh? (No material, or one that reads it.)"""
@@ -103,8 +103,13 @@ class MaterialReader:
         if key not in self._by_side:
             one = material if material.double_sided == double else replace(material, double_sided=double)
             self._by_side[key] = one
-            self.frames[id(one)] = self.frames.get(id(material), {})
+            self.frames[id(one)] = dict(self.frames.get(id(material), {}))
+            if id(material) in self.tiles:
+                self.tiles[id(one)] = partial(self._sided_tile, self.tiles[id(material)], double)
         return self._by_side[key]
+
+    def _sided_tile(self, read: Callable[[Tile], Material], double: bool, tile: Tile) -> Material:
+        return self._sided(read(tile), double)
 
     def _bound_prim(self, prim: Any) -> Any:
         """The material bound for the purpose "full", else for "preview", else for all. ``ComputeBoundMaterial`` goes on
@@ -131,7 +136,10 @@ class MaterialReader:
         if material:
             key = str(material.GetPath())
             if key not in self._materials:
+                self._in_tiles = False
                 self._materials[key] = self._read(material)
+                if self._in_tiles:
+                    self.tiles[id(self._materials[key])] = partial(self._read_tile, material)
             return self._materials[key]
         name = self._unresolved(prim)
         if name is not None:
@@ -139,6 +147,14 @@ class MaterialReader:
                 self._materials[name] = self._from_materialx(name)
             return self._materials[name]
         return self._materials.setdefault("", Material(name="default", base_color=(1.0, 1.0, 1.0), roughness=0.5))
+
+    def _read_tile(self, material: Any, tile: Tile) -> Material:
+        read_before = dict(self._pixels)
+        self._tile = tile
+        try:
+            return self._read(material)
+        finally:
+            self._tile, self._pixels = None, read_before
 
     def _from_materialx(self, name: str) -> Material:
         """A material that usd-core could not compose because it lives in a MaterialX file."""
@@ -183,7 +199,7 @@ class MaterialReader:
         normal, normal_scale = self._normals(normal_map)
         opacity, alpha, alpha_map, threshold = self._opacity(shader)
         if alpha is not None:
-            if base is not None and not np.allclose(_frame(color_map), _frame(alpha_map)):
+            if base is not None and not _place(color_map).equals(_place(alpha_map)):
                 self.note(
                     f"material '{name}': colour and opacity differ in transform: the first one's is used for both"
                 )
@@ -204,18 +220,25 @@ class MaterialReader:
             emission=strength,
             emission_texture=emission,
         )
-        if rough and metal and not np.allclose(_frame(rough_map), _frame(metal_map)):
-            self.note(
-                f"material '{name}': roughness and metalness differ in transform: the first one's is used for both"
-            )
         nodes = {
             "base_color_texture": color_map,
             "orm_texture": rough_map if rough else metal_map,
             "normal_texture": normal_map,
             "emission_texture": glow_map,
         }
-        self.frames[id(out)] = {n: _frame(node) for n, node in nodes.items() if node}
+        places = {n: _place(node) for n, node in nodes.items() if node}
+        if rough and metal and not places["orm_texture"].equals(_place(metal_map)):
+            self.note(
+                f"material '{name}': roughness and metalness differ in transform: the first one's is used for both"
+            )
+        self._keep(out, places)
         return out
+
+    def _keep(self, material: Material, places: Mapping[str, Place]) -> None:
+        """Remember where the textures of a material read."""
+        sets = tuple(dict.fromkeys(p.primvar for p in places.values()))
+        self._sets[id(material)] = sets
+        self.frames[id(material)] = {n: uv_frames.Frame(p.matrix, sets.index(p.primvar)) for n, p in places.items()}
 
     def _opacity(self, shader: Any) -> tuple[float, Texture | None, Any, float]:
         """(factor, texture of one channel or None, its node, threshold) of what a surface covers."""
@@ -225,10 +248,8 @@ class MaterialReader:
         return factor[0], texture, node, threshold
 
     def in_one_frame(self, meshes: list[Mesh], keep_layout: bool = False) -> list[Mesh]:
-        """Texture transforms applied, and textures brought under one transform and wrap mode where they differ; or all
-        as it is (``keep_layout``: see ``asset.load``)."""
-        place = uv_frames.kept if keep_layout else uv_frames.unified
-        return place(meshes, self.frames, self.note)
+        """The meshes as their textures read them; see ``uv_frames.placed``."""
+        return uv_frames.placed(meshes, self.frames, self.note, self.tiles, keep_layout)
 
     def _scaled(
         self, node: Any, space: str, channel: str, constant: tuple[float, float, float]
@@ -263,11 +284,10 @@ class MaterialReader:
         return Texture(normals * np.float32(0.5) + np.float32(0.5), "linear", texture.wrap), 1.0
 
     def _texture(self, node: Any, space: str, channel: str = "rgb") -> Texture | None:
-        asset = _value(node.GetInput("file"))
-        text = asset.resolvedPath or asset.path if asset is not None else ""
+        text, there = _file(node.GetInput("file"))
         if not text:  # a slot for a texture, without one
             return None
-        pixels = self.companions.read(lambda: self._image(text))
+        pixels = self._read_image(text, there)
         if pixels is None:
             return None
         encoding = str(_value(node.GetInput("sourceColorSpace")) or "auto")
@@ -284,7 +304,20 @@ class MaterialReader:
                 pixels = pixels if pixels.shape[2] == 4 else _opaque(pixels)
             pixels = pixels[..., _CHANNEL[channel]][..., None]
         wraps = tuple(_WRAPS.get(str(_value(node.GetInput(k))), "repeat") for k in ("wrapS", "wrapT"))
-        return Texture(np.ascontiguousarray(pixels), space, wraps)  # type: ignore[arg-type]
+        texture = Texture(np.ascontiguousarray(pixels), space, wraps)  # type: ignore[arg-type]
+        if self._tile is None or not udim.is_tiled(text):
+            return texture
+        return udim.fitted(texture, self._tile, self.note)
+
+    def _read_image(self, text: str, there: bool) -> NDArray | None:
+        """Pixels of a file. None if it is missing and that is to be ignored, or if it is one in tiles and none is
+        asked for. ``there``: is it known that some of its tiles exist?"""
+        if not udim.is_tiled(text):
+            return self.companions.read(lambda: self._image(text))
+        self._in_tiles = True
+        if self._tile is None:
+            return None
+        return udim.read_tile(text, self._tile, self.path, self.companions, self._image, there)
 
     def _image(self, text: str) -> NDArray:
         if text not in self._pixels:
@@ -299,6 +332,20 @@ class MaterialReader:
             else:
                 self._pixels[text] = images.read(self.companions.find(text, self.path))
         return self._pixels[text]
+
+
+def _file(source: Any) -> tuple[str, bool]:
+    """(name of the file that an input holds, as USD resolves it, or empty; does it stand for tiles that exist?)"""
+    from pxr import UsdShade
+
+    asset = _value(source)
+    if asset is None or not (asset.resolvedPath or asset.path):
+        return "", False
+    if not UsdShade.UdimUtils.IsUdimIdentifier(asset.path):
+        return asset.resolvedPath or asset.path, False
+    given = UsdShade.Utils.GetValueProducingAttributes(source)[0].GetPropertyStack()
+    resolved = UsdShade.UdimUtils.ResolveUdimPath(asset.path, given[0].layer) if given else ""
+    return resolved or asset.path, bool(resolved)
 
 
 def _purpose(binding: Any) -> str:
@@ -353,22 +400,44 @@ def _vector(node: Any, key: str, default: float) -> Any:
     return (default,) * 4 if value is None else tuple(float(x) for x in value)
 
 
-def _frame(node: Any) -> NDArray[np.float64]:
-    """(2, 3) transform from the mesh's texture coordinates to those at which a sampler reads."""
+@dataclass(frozen=True)
+class Place:
+    """Where a texture reads: at ``matrix`` (2, 3) times the coordinates ``primvar``."""
+
+    primvar: str = "st"
+    matrix: NDArray[np.float64] = field(default_factory=lambda: uv_frames.affine(None))
+
+    def equals(self, other: Place) -> bool:
+        return self.primvar == other.primvar and np.allclose(self.matrix, other.matrix)
+
+
+def _place(node: Any) -> Place:
+    """Where a sampler reads, after the transforms before it."""
     from pxr import UsdShade
 
+    matrix = uv_frames.affine(None)
     source = node.GetInput("st")
-    attributes = UsdShade.Utils.GetValueProducingAttributes(source) if source else []
-    if attributes:
-        transform = UsdShade.Shader(attributes[0].GetPrim())
-        if transform and str(transform.GetIdAttr().Get()) == "UsdTransform2d":
-            scale, rotation, move = (_value(transform.GetInput(k)) for k in ("scale", "rotation", "translation"))
-            return uv_frames.usd_affine(
-                (1.0, 1.0) if scale is None else tuple(scale),
-                0.0 if rotation is None else float(rotation),
-                (0.0, 0.0) if move is None else tuple(move),
-            )
-    return uv_frames.affine(None)
+    for _ in range(MAX_TRANSFORMS):
+        if not source:
+            break
+        attributes = UsdShade.Utils.GetValueProducingAttributes(source)
+        if not attributes:
+            break
+        before = UsdShade.Shader(attributes[0].GetPrim())
+        kind = str(before.GetIdAttr().Get() or "") if before else ""
+        if kind.startswith("UsdPrimvarReader_float2"):
+            return Place(str(_value(before.GetInput("varname")) or "st"), matrix)
+        if kind != "UsdTransform2d":
+            break
+        scale, rotation, move = (_value(before.GetInput(k)) for k in ("scale", "rotation", "translation"))
+        first = uv_frames.usd_affine(
+            (1.0, 1.0) if scale is None else tuple(scale),
+            0.0 if rotation is None else float(rotation),
+            (0.0, 0.0) if move is None else tuple(move),
+        )
+        matrix = uv_frames.composed(matrix, first)
+        source = before.GetInput("in")
+    return Place(matrix=matrix)
 
 
 def _rgb(value: Any) -> tuple[float, float, float]:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from appearance_opt.asset import usd_shapes
+from appearance_opt.asset import usd_shapes, uv_frames
 from appearance_opt.asset.companions import Companions
 from appearance_opt.asset.origin import settle
 from appearance_opt.asset.paths import check_inside, read_bytes
@@ -317,13 +317,14 @@ class _Reader:
             corners = corners[:, ::-1]
         cofactor = np.linalg.inv(linear).T if abs(np.linalg.det(linear)) > 0 else np.eye(3)
         meshes = []
-        for material, uv_name, chosen in self.materials.bindings(prim, face_ids[face]):
-            names = [n for n in values if not n.startswith(_UVS) or n == _UVS + uv_name]
+        for material, uv_names, chosen in self.materials.bindings(prim, face_ids[face]):
+            names = [n for n in values if not n.startswith(_UVS) or n[len(_UVS) :] in uv_names]
             rows = np.stack([values[n][1].indices[corners[chosen]].ravel() for n in names], axis=1)
             if not len(rows):
                 continue
             used, index = np.unique(rows, axis=0, return_inverse=True)
-            got = {n.split(":")[0]: values[n][0][used[:, k]] for k, n in enumerate(names)}
+            got = {n: values[n][0][used[:, k]] for k, n in enumerate(names)}
+            uvs = uv_frames.stacked([got.get(_UVS + n) for n in uv_names])
             normals = got.get("normals")
             if normals is not None:
                 normals = normals @ cofactor
@@ -333,7 +334,7 @@ class _Reader:
                     positions=got["points"] @ linear + offset,  # in double precision until settled
                     faces=index.reshape(-1, 3).astype(np.int32),
                     normals=None if normals is None else normals.astype(np.float32),
-                    uvs=got["uvs"].astype(np.float32) if "uvs" in got else None,
+                    uvs=None if uvs is None else uvs.astype(np.float32),
                     colors=got["colors"].astype(np.float32) if "colors" in got else None,
                     material=material,
                     name=str(prim.GetName()),

@@ -2,21 +2,25 @@
 
 A material here has one set of texture coordinates, one transform and one wrap mode. Where a file says otherwise, each
 texture is drawn into an image that spans the coordinates which the meshes use, and the coordinates are moved there.
+``uv_sets`` does this for textures that read different sets of coordinates.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+
+from appearance_opt.asset import udim
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
     from numpy.typing import NDArray
 
-    from appearance_opt.asset.types import Mesh, Texture, Wrap
+    from appearance_opt.asset.types import Material, Mesh, Texture, Wrap
+    from appearance_opt.asset.udim import Tile
 
 MAX_TEXELS = 1 << 25
 """Texels of a resampled texture at most."""
@@ -43,99 +47,201 @@ def usd_affine(scale: Sequence[float], rotation: float, translation: Sequence[fl
     return np.array([[a, -b, b + translation[0]], [-p, q, 1 - q - translation[1]]])
 
 
+def composed(then: NDArray, first: NDArray) -> NDArray[np.float64]:
+    """(2, 3) matrix of two transforms after each other."""
+    return np.concatenate([then[:, :2] @ first[:, :2], (then[:, :2] @ first[:, 2] + then[:, 2])[:, None]], axis=1)
+
+
 def apply(matrix: NDArray, points: NDArray) -> NDArray[np.float64]:
     """(N, 2) points under a (2, 3) matrix."""
     return points @ matrix[:, :2].T + matrix[:, 2]
 
 
-def unified(
-    meshes: Sequence[Mesh], frames_of: Mapping[int, Mapping[str, NDArray]], note: Callable[[str], None]
+@dataclass(frozen=True)
+class Frame:
+    """Where a texture reads: at ``matrix`` (2, 3) times the coordinates of the set number ``coordinates``.
+
+    Until ``unified``, meshes whose material reads several sets hold them side by side in ``uvs``: (V, 2 * sets).
+    """
+
+    matrix: NDArray[np.float64] = field(default_factory=lambda: affine(None))
+    coordinates: int = 0
+
+    def of(self, uvs: NDArray) -> NDArray[np.float64]:
+        """(V, 2) places in the texture."""
+        return apply(self.matrix, uvs[:, 2 * self.coordinates : 2 * self.coordinates + 2])
+
+
+@dataclass(frozen=True)
+class Resampled:
+    """Textures under one frame. ``uvs``: (V, 2) of each mesh; ``textures``: by field name; ``what``: what they now
+    share, and what that costs; ``keeps_tangents``: do the meshes' tangents still fit the normal map?"""
+
+    uvs: list[NDArray[np.float32]]
+    textures: dict[str, Texture]
+    what: str = "common texture coordinates"
+    keeps_tangents: bool = True
+
+
+def stacked(sets: Sequence[NDArray | None]) -> NDArray | None:
+    """Sets of texture coordinates (V, 2) side by side; what a mesh lacks is taken from the first that it has. None if
+    it has none of them."""
+    there = next((s for s in sets if s is not None), None)
+    return None if there is None else np.concatenate([there if s is None else s for s in sets], axis=1)
+
+
+def placed(
+    meshes: Sequence[Mesh],
+    frames_of: dict[int, dict[str, Frame]],
+    note: Callable[[str], None],
+    tiles: Mapping[int, Callable[[Tile], Material]],
+    keep_layout: bool,
 ) -> list[Mesh]:
-    """The meshes with the transforms of their textures applied, and textures brought under one transform and wrap mode
-    where they differ. ``frames_of``: by ``id`` of a material, the transform (2, 3) of each of its textures by field
-    name; materials that are not there stay. ``note``: told what was resampled."""
+    """What a reader's meshes become: taken apart into the ``tiles`` of their textures (``udim.split``), then
+    ``unified``; or all as it is (``keep_layout``: see ``asset.load``)."""
+    if keep_layout:
+        return kept(meshes, frames_of, note)
+    return unified(udim.split(meshes, tiles, frames_of, note) if tiles else meshes, frames_of, note)
+
+
+def unified(
+    meshes: Sequence[Mesh], frames_of: Mapping[int, Mapping[str, Frame]], note: Callable[[str], None]
+) -> list[Mesh]:
+    """The meshes with the transforms of their textures applied, and textures brought under one set of coordinates, one
+    transform and one wrap mode where they differ. ``frames_of``: by ``id`` of a material, the frame of each of its
+    textures by field name; materials that are not there stay. ``note``: told what was resampled."""
     out = list(meshes)
-    wearers: dict[int, list[int]] = {}
-    for k, m in enumerate(meshes):
-        if m.uvs is not None:
-            wearers.setdefault(id(m.material), []).append(k)
-    for own in wearers.values():
+    for own in _by_material(meshes):
         material = meshes[own[0]].material
         frames = {n: f for n, f in frames_of.get(id(material), {}).items() if getattr(material, n) is not None}
         if not frames:
+            for k in own:
+                out[k] = replace(meshes[k], uvs=meshes[k].uvs[:, :2])  # type: ignore[index]
             continue
         textures = {n: getattr(material, n) for n in frames}
         uvs = [np.asarray(meshes[k].uvs) for k in own]
-        new = material
-        placed = [apply(next(iter(frames.values())), uv).astype(np.float32) for uv in uvs]
-        if not alike(uvs, textures, frames):
-            # tangents follow the coordinates, and the normal map follows the tangents
-            leading = "normal_texture" if "normal_texture" in textures else next(iter(textures))
-            found = in_one_frame(uvs, textures, frames, leading)
-            differ = f"material '{material.name}': its textures differ in transform or wrap mode"
-            if found is None:
-                note(f"{differ}, and are too large to be resampled: the first one's are used for all")
-            else:
-                note(f"{differ}: resampled to common texture coordinates")
-                placed, new = found[0], replace(material, **found[1])  # type: ignore[arg-type]
+        frames = _where_sets_differ(uvs, frames)
+        first = next(iter(frames.values()))
+        placed, new, differ = [first.of(uv).astype(np.float32) for uv in uvs], material, ""
+        own_tangents = True
+        if any(f.coordinates != first.coordinates for f in frames.values()):
+            differ = "texture coordinates"
+        elif not alike(uvs, textures, frames):
+            differ = "transform or wrap mode"
+        if differ:
+            told = f"material '{material.name}': its textures differ in {differ}"
+            found = _resampled_alike(told, [meshes[k] for k in own], textures, frames, note)
+            if found is not None:
+                placed, new = found.uvs, replace(material, **found.textures)  # type: ignore[arg-type]
+                own_tangents = found.keeps_tangents
         for k, uv in zip(own, placed, strict=True):
-            out[k] = replace(meshes[k], uvs=uv, material=new)
+            tangents = meshes[k].tangents if own_tangents else None
+            out[k] = replace(meshes[k], uvs=uv, tangents=tangents, material=new)
     return out
 
 
+def _by_material(meshes: Sequence[Mesh]) -> list[list[int]]:
+    """Numbers of the meshes with texture coordinates, those of one material together."""
+    out: dict[int, list[int]] = {}
+    for k, mesh in enumerate(meshes):
+        if mesh.uvs is not None:
+            out.setdefault(id(mesh.material), []).append(k)
+    return list(out.values())
+
+
+def _where_sets_differ(uvs: Sequence[NDArray], frames: Mapping[str, Frame]) -> dict[str, Frame]:
+    """The frames, on as few sets as there are different ones: many files repeat their only set."""
+    used = list(dict.fromkeys(f.coordinates for f in frames.values()))
+    same: dict[int, int] = {}
+    for k in used:
+        equal = (j for j in used[: used.index(k)] if all(_columns_equal(uv, j, k) for uv in uvs))
+        same[k] = next(equal, k)
+    return {n: replace(f, coordinates=same[f.coordinates]) for n, f in frames.items()}
+
+
+def _columns_equal(uvs: NDArray, first: int, second: int) -> bool:
+    return bool(np.array_equal(uvs[:, 2 * first : 2 * first + 2], uvs[:, 2 * second : 2 * second + 2]))
+
+
+def _resampled_alike(
+    told: str,
+    meshes: Sequence[Mesh],
+    textures: Mapping[str, Texture],
+    frames: Mapping[str, Frame],
+    note: Callable[[str], None],
+) -> Resampled | None:
+    """The textures of ``meshes`` under one frame, or None if they would be too large; ``note`` is told, after
+    ``told``."""
+    if len({f.coordinates for f in frames.values()}) > 1:
+        from appearance_opt.asset.uv_sets import in_one_set
+
+        found = in_one_set(meshes, textures, frames)
+    else:
+        # tangents follow the coordinates, and the normal map follows the tangents
+        leading = "normal_texture" if "normal_texture" in textures else next(iter(textures))
+        found = in_one_frame([np.asarray(m.uvs) for m in meshes], textures, frames, leading)
+    if found is None:
+        note(f"{told}, and are too large to be resampled: the first one's are used for all")
+    else:
+        note(f"{told}: resampled to {found.what}")
+    return found
+
+
 def kept(
-    meshes: Sequence[Mesh], frames_of: Mapping[int, Mapping[str, NDArray]], note: Callable[[str], None]
+    meshes: Sequence[Mesh], frames_of: Mapping[int, Mapping[str, Frame]], note: Callable[[str], None]
 ) -> list[Mesh]:
-    """The meshes as they are, for ``keep_layout`` of ``asset.load``; ``note`` is told whose textures would have been
-    moved. Parameters as for ``unified``."""
+    """The meshes with the first set of texture coordinates that their materials read, as it is, for ``keep_layout`` of
+    ``asset.load``; ``note`` is told whose textures would have been moved. Parameters as for ``unified``."""
     for material in {id(m.material): m.material for m in meshes}.values():
         frames = frames_of.get(id(material), {})
-        moved = [n for n, f in frames.items() if getattr(material, n) is not None and not np.allclose(f, affine(None))]
+        unmoved = (np.allclose(f.matrix, affine(None)) and f.coordinates == 0 for f in frames.values())
+        moved = [n for n, still in zip(frames, unmoved, strict=True) if getattr(material, n) is not None and not still]
         if moved:
             which = ", ".join(n.replace("_texture", "").replace("_", " ") for n in moved)
             told = f"material '{material.name}': the transform of its textures ({which}) is not applied"
             note(f"{told}: the mesh keeps its texture coordinates")
-    return list(meshes)
+    return [m if m.uvs is None else replace(m, uvs=m.uvs[:, :2]) for m in meshes]
 
 
-def alike(uvs: Sequence[NDArray], textures: Mapping[str, Texture], frames: Mapping[str, NDArray]) -> bool:
-    """Can the textures share the first one's transform and wrap mode? Wrap modes do not matter within the image."""
+def alike(uvs: Sequence[NDArray], textures: Mapping[str, Texture], frames: Mapping[str, Frame]) -> bool:
+    """Can the textures, of one set, share the first one's transform and wrap mode? Wrap modes do not matter within the
+    image."""
     first = next(iter(frames.values()))
-    if any(not np.allclose(frame, first, atol=1e-9) for frame in frames.values()):
+    if any(not np.allclose(frame.matrix, first.matrix, atol=1e-9) for frame in frames.values()):
         return False
     if len({mode for t in textures.values() for mode in t.wrap}) == 1:
         return True
-    placed = np.concatenate([apply(first, uv) for uv in uvs])
+    placed = np.concatenate([first.of(uv) for uv in uvs])
     return bool(placed.min() >= -1e-6 and placed.max() <= 1 + 1e-6)
 
 
 def in_one_frame(
-    uvs: Sequence[NDArray], textures: Mapping[str, Texture], frames: Mapping[str, NDArray], leading: str
-) -> tuple[list[NDArray[np.float32]], dict[str, Texture]] | None:
-    """(new texture coordinates (N, 2) each, new textures), or None if the images would be too large.
+    uvs: Sequence[NDArray], textures: Mapping[str, Texture], frames: Mapping[str, Frame], leading: str
+) -> Resampled | None:
+    """Textures that read the same set of coordinates under one transform, or None if the images would be too large.
 
-    ``frames``: the transform of each texture, (2, 3). ``leading``: the texture whose frame the others are brought
-    to; where it is the finest, it is copied texel by texel. The others are read bilinearly.
+    ``frames``: those of the textures, on one set of coordinates. ``leading``: the texture whose frame the others are
+    brought to; where it is the finest, it is copied texel by texel. The others are read bilinearly.
     """
-    frame = frames[leading]
-    if min(abs(np.linalg.det(f[:, :2])) for f in frames.values()) < 1e-12:
+    frame = frames[leading].matrix
+    if min(abs(np.linalg.det(f.matrix[:, :2])) for f in frames.values()) < 1e-12:
         return None
     height, width = textures[leading].pixels.shape[:2]
     back = np.linalg.inv(frame[:, :2])
     # enough texels for the finest of them, in whole multiples so that the leading one's texels stay texels
     finer = 1.0
     for name, texture in textures.items():
-        step = frames[name][:, :2] @ back * np.array(texture.pixels.shape[1::-1])[:, None]
+        step = frames[name].matrix[:, :2] @ back * np.array(texture.pixels.shape[1::-1])[:, None]
         finer = max(finer, *(np.linalg.norm(step, axis=0) / (width, height)))
     size = np.array([width, height]) * int(np.ceil(finer - 1e-6))
-    placed = [apply(frame, uv) * size for uv in uvs]
+    placed = [frames[leading].of(uv) * size for uv in uvs]
     low = np.floor(np.min([p.min(axis=0) for p in placed], axis=0)) - 1
     extent = np.ceil(np.max([p.max(axis=0) for p in placed], axis=0)) + 1 - low
     if not extent.prod() <= MAX_TEXELS:  # nor for coordinates that are no numbers
         return None
     to_uv = np.concatenate([back, -back @ frame[:, 2:]], axis=1)
-    new = {n: _resampled(t, frames[n], to_uv, low, size, extent) for n, t in textures.items()}
-    return [((p - low) / extent).astype(np.float32) for p in placed], new
+    new = {n: _resampled(t, frames[n].matrix, to_uv, low, size, extent) for n, t in textures.items()}
+    return Resampled([((p - low) / extent).astype(np.float32) for p in placed], new)
 
 
 def _resampled(
@@ -147,14 +253,14 @@ def _resampled(
     for start in range(0, rows, step):
         y, x = np.meshgrid(np.arange(start, min(start + step, rows)), np.arange(columns), indexing="ij")
         centres = (np.stack([x.ravel(), y.ravel()], axis=1) + 0.5 + low) / size
-        values = _bilinear(texture, apply(frame, apply(to_uv, centres)))
+        values = bilinear(texture, apply(frame, apply(to_uv, centres)))
         if out.dtype.kind == "u":
             values = np.rint(values)
         out[start : start + step] = values.reshape(*x.shape, -1).astype(out.dtype)
     return replace(texture, pixels=out, wrap=("clamp", "clamp"))
 
 
-def _bilinear(texture: Texture, uv: NDArray) -> NDArray[np.float64]:
+def bilinear(texture: Texture, uv: NDArray) -> NDArray[np.float64]:
     """Stored values (N, C) at texture coordinates, wrapped as the texture says."""
     height, width = texture.pixels.shape[:2]
     # the rounding of a frame there and back must not mix neighbours
