@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from appearance_opt.asset import load
+from appearance_opt.asset import load, save
 from appearance_opt.asset.normals import unit
+from appearance_opt.asset.types import Asset
 from appearance_opt.errors import InputError
 from tests.test_asset_gltf import triangle_document, write_glb
 from tests.test_asset_gltf_nodes import ball, document
@@ -101,3 +102,108 @@ def test_the_scene_that_is_taken_is_named(tmp_path: Path, given: dict, taken: st
     assert [float(m.positions[:, 0].min()) for m in asset.meshes] == [place]
     other = {"left": "right", "right": "left"}[taken]
     assert f"scene '{taken}' is taken, others ignored: '{other}'" in asset.notes
+
+
+SQUARES = (
+    "int[] faceVertexCounts = [4, 4]\nint[] faceVertexIndices = [0, 1, 4, 3, 1, 2, 5, 4]\n"
+    "point3f[] points = [(0, 0, 0), (1, 0, 0), (2, 0, 1), (0, 1, 0), (1, 1, 0), (2, 1, 1)]\n"
+)
+"""Two squares side by side, folded where they meet by 45 degrees."""
+
+
+def usd(folder: Path, text: str, more: str = "", **options: object) -> Asset:
+    """A stage with one mesh of these squares."""
+    path = folder / "x.usda"
+    path.write_text(f'#usda 1.0\n(upAxis = "Y"\nmetersPerUnit = 1)\n{more}def Mesh "m"\n{{\n{SQUARES}{text}\n}}\n')
+    return load(path, **options)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(("scheme", "each"), [("none", 2), ("catmullClark", 8)])
+def test_holes_are_not_drawn(tmp_path: Path, scheme: str, each: int) -> None:
+    text = f'uniform token subdivisionScheme = "{scheme}"\nint[] holeIndices = [0]'
+    mesh = usd(tmp_path, text).meshes[0]
+    assert len(mesh.faces) == each
+    whole = usd(tmp_path, f'uniform token subdivisionScheme = "{scheme}"').meshes[0]
+    # a hole shapes what lies around it
+    assert set(map(tuple, mesh.positions.tolist())) <= set(map(tuple, whole.positions.tolist()))
+    assert mesh.positions[:, 0].min() >= 0.9
+
+
+FOLDED = np.array([[0, 0, 1], [-(0.5**0.5), 0, 0.5**0.5]])
+
+
+@pytest.mark.parametrize("scheme", ["none", "bilinear"])
+@pytest.mark.parametrize(("more", "sign"), [("", 1), ('uniform token orientation = "leftHanded"', -1)])
+def test_a_polygonal_mesh_without_normals_is_faceted(tmp_path: Path, scheme: str, more: str, sign: int) -> None:
+    mesh = usd(tmp_path, f'uniform token subdivisionScheme = "{scheme}"\n{more}').meshes[0]
+    np.testing.assert_allclose(mesh.normals[mesh.faces[::2, 0]], sign * FOLDED, atol=1e-6)
+    np.testing.assert_allclose(mesh.normals[mesh.faces[1::2, 0]], sign * FOLDED, atol=1e-6)
+    assert len(mesh.positions) == 8
+    p = mesh.positions[mesh.faces].astype(np.float64)
+    wound = np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0])
+    assert (np.sum(wound * mesh.normals[mesh.faces[:, 0]], axis=1) > 0).all()
+
+
+def test_a_mesh_to_be_baked_onto_keeps_its_vertices(tmp_path: Path) -> None:
+    mesh = usd(tmp_path, 'uniform token subdivisionScheme = "none"', keep_layout=True).meshes[0]
+    assert mesh.normals is None
+    assert len(mesh.positions) == 6
+
+
+READER = """def Material "glass"
+{
+    token outputs:surface.connect = </glass/Surface.outputs:surface>
+    def Shader "Surface"
+    {
+        uniform token info:id = "UsdPreviewSurface"
+        float inputs:opacity.connect = </glass/veil.outputs:result>
+        float inputs:opacityThreshold = THRESHOLD
+        token outputs:surface
+    }
+    def Shader "veil"
+    {
+        uniform token info:id = "UsdPrimvarReader_float"
+        string inputs:varname = "displayOpacity"
+        float outputs:result
+    }
+}
+"""
+
+
+@pytest.mark.parametrize(
+    ("how", "values", "alpha"),
+    [("constant", "[0.25]", [0.25] * 6), ("vertex", "[0, 0.2, 0.4, 0.6, 0.8, 1]", [0, 0.2, 0.4, 0.6, 0.8, 1])],
+)
+@pytest.mark.parametrize(("bound", "mode"), [(None, "blend"), ("0", "blend"), ("0.5", "mask")])
+def test_display_opacity_is_kept(
+    tmp_path: Path, how: str, values: str, alpha: list[float], bound: str | None, mode: str
+) -> None:
+    text = f'float[] primvars:displayOpacity = {values} (interpolation = "{how}")\n'
+    text += 'uniform token subdivisionScheme = "none"\n'
+    if bound:
+        text += "rel material:binding = </glass>"
+    asset = usd(tmp_path, text, READER.replace("THRESHOLD", bound) if bound else "")
+    for again in (asset, written(asset, tmp_path / "y.usda"), written(asset, tmp_path / "y.glb")):
+        mesh = again.meshes[0]
+        assert mesh.material.alpha_mode == mode
+        assert mesh.colors is not None
+        got = {tuple(p): a for p, a in zip(mesh.positions.tolist(), mesh.colors[:, 3].tolist(), strict=True)}
+        points = [(0, 0, 0), (1, 0, 0), (2, 0, 1), (0, 1, 0), (1, 1, 0), (2, 1, 1)]
+        np.testing.assert_allclose([got[p] for p in points], alpha, atol=1e-6)
+
+
+def written(asset: Asset, path: Path) -> Asset:
+    """The asset after it was written and read."""
+    save(asset, path)
+    return load(path)
+
+
+@pytest.mark.parametrize("bound", [False, True])
+def test_display_opacity_that_says_nothing_changes_nothing(tmp_path: Path, bound: bool) -> None:
+    text = 'float[] primvars:displayOpacity = [1] (interpolation = "constant")\n'
+    if bound:  # by a material that does not read it
+        text = text.replace("[1]", "[0.5]") + "rel material:binding = </plain>\n"
+    more = 'def Material "plain"\n{\n}\n' if bound else ""
+    mesh = usd(tmp_path, text + 'uniform token subdivisionScheme = "none"', more).meshes[0]
+    assert mesh.material.alpha_mode == "opaque"
+    assert mesh.colors is None

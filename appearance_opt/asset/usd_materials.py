@@ -46,11 +46,13 @@ class MaterialReader:
         self._tile: Tile | None = None
         self._in_tiles = False
         self._pixels: dict[str, NDArray] = {}
-        self._by_side: dict[tuple[int, bool], Material] = {}
+        self._worn: dict[tuple[int, bool, bool], Material] = {}
 
-    def bindings(self, prim: Any, face_ids: NDArray) -> Iterator[tuple[Material, list[str], NDArray[np.bool_]]]:
+    def bindings(
+        self, prim: Any, face_ids: NDArray, covers_in_part: bool = False
+    ) -> Iterator[tuple[Material, list[str], NDArray[np.bool_]]]:
         """(material, primvars of the texture coordinates that it reads, mask of the triangles that wear it);
-        ``face_ids``: face of the file of each triangle."""
+        ``face_ids``: face of the file of each triangle. ``covers_in_part``: does the mesh's displayOpacity say so?"""
         from pxr import UsdGeom
 
         double = bool(UsdGeom.Gprim(prim).GetDoubleSidedAttr().Get())
@@ -59,9 +61,11 @@ class MaterialReader:
             faces = np.array(UsdGeom.Subset(subset).GetIndicesAttr().Get() or [], np.int64)
             mask = np.isin(face_ids, faces) & rest
             rest &= ~mask
-            yield self._sided(self._bound(subset), double), self._uv_names(prim, subset), mask
+            material = self._on_mesh(self._bound(subset), double, covers_in_part)
+            yield material, self._uv_names(prim, subset), mask
         if rest.any():
-            yield self._sided(self._bound(prim), double), self._uv_names(prim, prim), rest
+            material = self._on_mesh(self._bound(prim), double, covers_in_part)
+            yield material, self._uv_names(prim, prim), rest
 
     def uv_names(self, prim: Any) -> list[str]:
         """The primvars that hold texture coordinates of a mesh, of which each of its materials reads some."""
@@ -87,29 +91,34 @@ class MaterialReader:
         read = self._sets.get(id(self._bound(wearer)), ())
         return [n if api.HasPrimvar(n) else usual for n in read] or [usual]
 
-    def uses_display_color(self, prim: Any) -> bool:
-        """Is displayColor what colours the mesh? (No material, or one that reads it.)"""
+    def reads_primvar(self, prim: Any, name: str) -> bool:
+        """Does displayColor or displayOpacity count? (No material, or one that reads it.)"""
         from pxr import UsdShade
 
         materials = [m for m in (self._bound_prim(w) for w in (prim, *self._subsets(prim))) if m]
         if not materials:
             return not self._unresolved(prim)
         readers = (UsdShade.Shader(n) for m in materials for n in _descendants(m.GetPrim()))
-        return any(r and str(_value(r.GetInput("varname"))) == "displayColor" for r in readers)
+        return any(r and str(_value(r.GetInput("varname"))) == name for r in readers)
 
-    def _sided(self, material: Material, double: bool) -> Material:
-        """The material for meshes of which both sides are seen, or one: in USD the mesh says so."""
-        key = (id(material), double)
-        if key not in self._by_side:
+    def _on_mesh(self, material: Material, double: bool, covers_in_part: bool) -> Material:
+        """The material with what in USD the mesh says: are both sides of it seen, or one, and does it
+        cover what lies behind it in part?"""
+        key = (id(material), double, covers_in_part)
+        if key not in self._worn:
             one = material if material.double_sided == double else replace(material, double_sided=double)
-            self._by_side[key] = one
+            if covers_in_part and one.alpha_mode == "opaque":
+                one = replace(one, alpha_mode="blend")
+            self._worn[key] = one
             self.frames[id(one)] = dict(self.frames.get(id(material), {}))
             if id(material) in self.tiles:
-                self.tiles[id(one)] = partial(self._sided_tile, self.tiles[id(material)], double)
-        return self._by_side[key]
+                self.tiles[id(one)] = partial(self._tile_on_mesh, self.tiles[id(material)], double, covers_in_part)
+        return self._worn[key]
 
-    def _sided_tile(self, read: Callable[[Tile], Material], double: bool, tile: Tile) -> Material:
-        return self._sided(read(tile), double)
+    def _tile_on_mesh(
+        self, read: Callable[[Tile], Material], double: bool, covers_in_part: bool, tile: Tile
+    ) -> Material:
+        return self._on_mesh(read(tile), double, covers_in_part)
 
     def _bound_prim(self, prim: Any) -> Any:
         """The material bound for the purpose "full", else for "preview", else for all. ``ComputeBoundMaterial`` goes on
@@ -204,7 +213,9 @@ class MaterialReader:
                     f"material '{name}': colour and opacity differ in transform: the first one's is used for both"
                 )
             base, color_map = with_alpha(base, alpha), color_map if base is not None else alpha_map
-        transparent = alpha is not None or opacity < 1
+        given = shader.GetInput("opacity")
+        veiled = bool(given) and given.HasConnectedSource() and alpha_map is None  # by a primvar of the mesh
+        transparent = alpha is not None or opacity < 1 or veiled
         out = Material(
             name=name,
             base_color=base_factor,

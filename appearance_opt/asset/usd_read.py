@@ -10,7 +10,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from appearance_opt.asset import usd_shapes, uv_frames
+from appearance_opt.asset.alpha import OPAQUE
 from appearance_opt.asset.companions import Companions
+from appearance_opt.asset.normals import accumulate, unit
 from appearance_opt.asset.origin import settle
 from appearance_opt.asset.paths import check_inside, read_bytes
 from appearance_opt.asset.polygons import Polygons, triangulate
@@ -68,7 +70,7 @@ def _read_stage(path: Path, refine: int, variants: dict[str, str], companions: C
         raise InputError(f"{path}: not a readable USD file")
     _select(stage, variants, path)
     _refuse_escapes(stage, path, companions)
-    return _Reader(stage, path, refine, companions).asset(keep_layout)
+    return _Reader(stage, path, refine, companions, keep_layout).asset()
 
 
 def _select(stage: Any, variants: dict[str, str], path: Path) -> None:
@@ -103,18 +105,20 @@ def _metres_per_unit(stage: Any) -> float:
 @dataclass(frozen=True)
 class _Geometry:
     """A mesh in its own frame. ``values``: positions ("points") and other attributes by name, each with faces of its
-    own; ``face_ids``: the file's face of each face; ``flipped``: do faces turn clockwise?"""
+    own; ``face_ids``: the file's face of each face; ``flipped``: do faces turn clockwise? ``holes``:
+    faces of the file that are not drawn."""
 
     values: dict[str, tuple[NDArray, Polygons]]
     face_ids: NDArray[np.int64]
     flipped: bool
+    holes: NDArray[np.int64]
 
 
 class _Reader:
-    def __init__(self, stage: Any, path: Path, refine: int, companions: Companions) -> None:
+    def __init__(self, stage: Any, path: Path, refine: int, companions: Companions, keep_layout: bool) -> None:
         from pxr import Usd, UsdGeom
 
-        self.stage, self.path, self.refine = stage, path, refine
+        self.stage, self.path, self.refine, self.keep_layout = stage, path, refine, keep_layout
         self.companions, self.note = companions, companions.note
         self.to_metres = _TO_Y_UP[str(UsdGeom.GetStageUpAxis(stage))] * _metres_per_unit(stage)
         self.materials = MaterialReader(stage, path, companions)
@@ -122,7 +126,7 @@ class _Reader:
         self.time = Usd.TimeCode.EarliestTime()
         self.cache = UsdGeom.XformCache(self.time)
 
-    def asset(self, keep_layout: bool) -> Asset:
+    def asset(self) -> Asset:
         from pxr import Usd, UsdGeom
 
         meshes: list[Mesh] = []
@@ -135,7 +139,7 @@ class _Reader:
                 geometry = self._geometry(prim)
                 if geometry is not None:
                     meshes += self._split(prim, geometry, self._to_world(prim))
-        meshes = self.materials.in_one_frame(meshes, keep_layout)
+        meshes = self.materials.in_one_frame(meshes, self.keep_layout)
         meshes, origin = settle(meshes, self.note)
         return Asset(tuple(meshes), self.path.stem, self.companions.notes.lines(), origin=origin)
 
@@ -204,7 +208,8 @@ class _Reader:
 
         flipped = str(UsdGeom.Gprim(prim).GetOrientationAttr().Get()) == "leftHanded"
         if prim.IsA(UsdGeom.Mesh):
-            return _Geometry(*self._mesh(prim), flipped)
+            holes = UsdGeom.Mesh(prim).GetHoleIndicesAttr().Get(self.time)
+            return _Geometry(*self._mesh(prim, flipped), flipped, np.array(holes or [], np.int64))
         found = usd_shapes.triangles(prim, self.time)
         if found is None:
             self.note(f"{prim.GetTypeName()} '{prim.GetPath()}' ignored: only surfaces are read")
@@ -212,10 +217,13 @@ class _Reader:
         positions, normals, faces = found
         polygons = Polygons(np.full(len(faces), 3), faces.ravel())
         values = {"points": (positions, polygons), "normals": (normals, polygons), **self._colors(prim, polygons)}
-        return _Geometry(values, np.arange(len(faces)), flipped)
+        return _Geometry(values, np.arange(len(faces)), flipped, np.empty(0, np.int64))
 
-    def _mesh(self, prim: Any) -> tuple[dict[str, tuple[NDArray, Polygons]], NDArray[np.int64]]:
-        """Attributes and the file's faces of a mesh, refined if it is a subdivision surface (see ``_Geometry``)."""
+    def _mesh(self, prim: Any, flipped: bool) -> tuple[dict[str, tuple[NDArray, Polygons]], NDArray[np.int64]]:
+        """Attributes and the file's faces of a mesh, refined if it is a subdivision surface (see ``_Geometry``).
+
+        A polygonal mesh without normals "should be treated and rendered as faceted, with no attempt to
+        compute smooth normals" (UsdGeomMesh, "A Note About Normals"), and so are bilinear ones."""
         from pxr import UsdGeom
 
         mesh = UsdGeom.Mesh(prim)
@@ -232,6 +240,8 @@ class _Reader:
         for name, (value, where) in self._primvars(prim, mesh, polygons).items():
             values[name] = (value, where)
         scheme = str(mesh.GetSubdivisionSchemeAttr().Get())
+        if scheme in ("none", "bilinear") and "normals" not in values and not self.keep_layout:
+            values["normals"] = _facets(points, polygons, flipped)
         if scheme in ("catmullClark", "loop") and self.refine > 0:
             values.pop("normals", None)
             if scheme == "loop":
@@ -297,11 +307,17 @@ class _Reader:
     def _colors(self, prim: Any, polygons: Polygons) -> dict[str, tuple[NDArray, Polygons]]:
         from pxr import UsdGeom
 
-        color = UsdGeom.PrimvarsAPI(prim).GetPrimvar("displayColor")
-        found = None
-        if color and color.HasValue() and self.materials.uses_display_color(prim):
-            found = _expand(color.ComputeFlattened(self.time), color.GetInterpolation(), polygons, 3)
-        return {} if found is None else {"colors": found}
+        api = UsdGeom.PrimvarsAPI(prim)
+        out = {}
+        for name, primvar, width in (("colors", "displayColor", 3), ("opacity", "displayOpacity", 1)):
+            given = api.GetPrimvar(primvar)
+            if given and given.HasValue() and self.materials.reads_primvar(prim, primvar):
+                found = _expand(given.ComputeFlattened(self.time), given.GetInterpolation(), polygons, width)
+                if found is not None:
+                    out[name] = found
+        if "opacity" in out and (out["opacity"][0] >= OPAQUE).all():
+            del out["opacity"]
+        return out
 
     def _split(self, prim: Any, geometry: _Geometry, to_world: Any) -> list[Mesh]:
         """Triangles with one index for all attributes, one mesh per material."""
@@ -317,7 +333,10 @@ class _Reader:
             corners = corners[:, ::-1]
         cofactor = np.linalg.inv(linear).T if abs(np.linalg.det(linear)) > 0 else np.eye(3)
         meshes = []
-        for material, uv_names, chosen in self.materials.bindings(prim, face_ids[face]):
+        if len(geometry.holes):
+            drawn = ~np.isin(face_ids[face], geometry.holes)
+            corners, face = corners[drawn], face[drawn]
+        for material, uv_names, chosen in self.materials.bindings(prim, face_ids[face], "opacity" in values):
             names = [n for n in values if not n.startswith(_UVS) or n[len(_UVS) :] in uv_names]
             rows = np.stack([values[n][1].indices[corners[chosen]].ravel() for n in names], axis=1)
             if not len(rows):
@@ -325,6 +344,10 @@ class _Reader:
             used, index = np.unique(rows, axis=0, return_inverse=True)
             got = {n: values[n][0][used[:, k]] for k, n in enumerate(names)}
             uvs = uv_frames.stacked([got.get(_UVS + n) for n in uv_names])
+            colors = got.get("colors")
+            if "opacity" in got:
+                colors = np.ones((len(used), 3)) if colors is None else colors
+                colors = np.concatenate([colors, got["opacity"]], axis=1)
             normals = got.get("normals")
             if normals is not None:
                 normals = normals @ cofactor
@@ -335,12 +358,24 @@ class _Reader:
                     faces=index.reshape(-1, 3).astype(np.int32),
                     normals=None if normals is None else normals.astype(np.float32),
                     uvs=None if uvs is None else uvs.astype(np.float32),
-                    colors=got["colors"].astype(np.float32) if "colors" in got else None,
+                    colors=None if colors is None else colors.astype(np.float32),
                     material=material,
                     name=str(prim.GetName()),
                 )
             )
         return meshes
+
+
+def _facets(points: NDArray, polygons: Polygons, flipped: bool) -> tuple[NDArray, Polygons]:
+    """The normals of polygons, the same for all of their corners; equal ones are one value."""
+    face = np.repeat(np.arange(len(polygons.counts)), polygons.counts)
+    corner = points[polygons.indices]
+    first = corner[(np.cumsum(polygons.counts) - polygons.counts)[face]]
+    total = np.zeros((len(polygons.counts), 3))
+    accumulate(total, face, np.cross(corner - first, corner[polygons.next()] - first))
+    normals = unit(-total if flipped else total).astype(np.float32)
+    values, index = np.unique(normals, axis=0, return_inverse=True)
+    return values.astype(np.float64), Polygons(polygons.counts, index.ravel()[face])
 
 
 def _expand(value: Any, how: str, polygons: Polygons, width: int) -> tuple[NDArray, Polygons] | None:

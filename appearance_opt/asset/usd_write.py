@@ -69,13 +69,13 @@ def _write_stage(asset: Asset, root: Path, textures: str) -> None:
     if any(asset.origin):
         top.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Vec3d(*asset.origin))
     UsdGeom.Scope.Define(stage, f"/{name}/Materials")
-    materials: dict[tuple[int, bool], Any] = {}
+    materials: dict[tuple[int, bool, bool], Any] = {}
     for k, mesh in enumerate(asset.meshes):
-        key = (id(mesh.material), _colored(mesh))
+        key = (id(mesh.material), _colored(mesh), _veiled(mesh))
         if key not in materials:
             word = Tf.MakeValidIdentifier(mesh.material.name)[:MAX_NAME]
             target = f"/{name}/Materials/M{len(materials)}_{word}"
-            materials[key] = _material(stage, target, mesh.material, root.parent / textures, _colored(mesh))
+            materials[key] = _material(stage, target, mesh.material, root.parent / textures, key[1], key[2])
         _mesh(stage, f"/{name}/G{k}_{Tf.MakeValidIdentifier(mesh.name)}", mesh, materials[key])
     stage.GetRootLayer().Save()
 
@@ -83,6 +83,13 @@ def _write_stage(asset: Asset, root: Path, textures: str) -> None:
 def _colored(mesh: Mesh) -> bool:
     """Do vertex colours drive the base colour?"""
     return mesh.colors is not None and mesh.material.base_color_texture is None
+
+
+def _veiled(mesh: Mesh) -> bool:
+    """Does the alpha of vertex colours drive the opacity?"""
+    if mesh.colors is None or mesh.colors.shape[1] < 4 or mesh.material.alpha_mode == "opaque":
+        return False
+    return coverage(mesh.material)[1] is None
 
 
 def _mesh(stage: Any, target: str, mesh: Mesh, material: Any) -> None:
@@ -110,23 +117,28 @@ def _mesh(stage: Any, target: str, mesh: Mesh, material: Any) -> None:
         color.Set(
             Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(mesh.colors[:, :3] * np.array(factor, np.float32), np.float32))
         )
+    if _veiled(mesh):
+        assert mesh.colors is not None
+        alpha = mesh.colors[:, 3] * np.float32(coverage(mesh.material)[0])
+        veil = api.CreatePrimvar("displayOpacity", Sdf.ValueTypeNames.FloatArray, UsdGeom.Tokens.vertex)
+        veil.Set(Vt.FloatArray.FromNumpy(np.ascontiguousarray(alpha, np.float32)))
     UsdShade.MaterialBindingAPI.Apply(out.GetPrim()).Bind(material)
 
 
-def _material(stage: Any, target: str, m: Material, folder: Path, colored: bool) -> Any:
+def _material(stage: Any, target: str, m: Material, folder: Path, colored: bool, veiled: bool) -> Any:
     from pxr import UsdShade
 
     material = UsdShade.Material.Define(stage, target)
     preview = _Preview(stage, target, folder)
     material.CreateSurfaceOutput().ConnectToSource(preview.shader.ConnectableAPI(), "surface")
     if colored:
-        preview.vertex_color("diffuseColor")
+        preview.primvar("diffuseColor", "Color3f", "UsdPrimvarReader_float3", "displayColor")
     else:
         preview.color("diffuseColor", "base_color", m.base_color, m.base_color_texture)
     if m.emits:
         preview.color("emissiveColor", "emission", m.emission, m.emission_texture)
     preview.roughness_and_metalness(m)
-    preview.opacity(m)
+    preview.opacity(m, veiled)
     if m.normal_texture is not None:
         s = m.normal_scale
         node = preview.sampler("normal", m.normal_texture, "raw", (2 * s, 2 * s, 2, 1), (-s, -s, -1, 0))
@@ -200,11 +212,11 @@ class _Preview:
         scale = None if tuple(factor) == (1.0, 1.0, 1.0) else (*factor, 1.0)
         self.connect(name, "Color3f", self.sampler(key, texture, "sRGB", scale), "rgb")
 
-    def vertex_color(self, name: str) -> None:
-        """A colour that is the mesh's displayColor."""
-        reader = self._node("displayColor", "UsdPrimvarReader_float3")
-        reader.CreateInput("varname", self.types.String).Set("displayColor")
-        self.connect(name, "Color3f", reader, "result")
+    def primvar(self, name: str, kind: str, node: str, primvar: str) -> None:
+        """An input that is a primvar of the mesh."""
+        reader = self._node(primvar, node)
+        reader.CreateInput("varname", self.types.String).Set(primvar)
+        self.connect(name, kind, reader, "result")
 
     def roughness_and_metalness(self, m: Material) -> None:
         """Both, and occlusion, from one texture, or constants."""
@@ -219,12 +231,15 @@ class _Preview:
         if m.has_occlusion:
             self.connect("occlusion", "Float", node, "r")
 
-    def opacity(self, m: Material) -> None:
-        """Coverage by a constant or a texture, for the alpha test if there is one."""
+    def opacity(self, m: Material, veiled: bool) -> None:
+        """Coverage by the mesh's displayOpacity (``veiled``), a constant or a texture, for the alpha test if there is
+        one. A UsdPreviewSurface cannot multiply them."""
         factor, texture = coverage(m)
-        if factor == 1 and texture is None:
+        if factor == 1 and texture is None and not veiled:
             return
-        if texture is None:
+        if veiled:
+            self.primvar("opacity", "Float", "UsdPrimvarReader_float", "displayOpacity")
+        elif texture is None:
             self.shader.CreateInput("opacity", self.types.Float).Set(factor)
         else:
             pixels = images.encode_png(encoded_for(texture, "linear", (factor,)))
