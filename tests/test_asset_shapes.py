@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,8 @@ from appearance_opt.asset import load, save
 from appearance_opt.asset.normals import unit
 from appearance_opt.asset.types import Asset
 from appearance_opt.errors import InputError
+from appearance_opt.reference.mesh import merge
+from tests.conftest import make_asset
 from tests.test_asset_gltf import triangle_document, write_glb
 from tests.test_asset_gltf_nodes import ball, document
 
@@ -207,3 +210,12 @@ def test_display_opacity_that_says_nothing_changes_nothing(tmp_path: Path, bound
     mesh = usd(tmp_path, text + 'uniform token subdivisionScheme = "none"', more).meshes[0]
     assert mesh.material.alpha_mode == "opaque"
     assert mesh.colors is None
+
+
+def test_colours_with_and_without_alpha_are_drawn_together() -> None:
+    ball = make_asset(8, 16)
+    mesh = ball.meshes[0]
+    count = len(mesh.positions)
+    both = tuple(replace(mesh, colors=np.ones((count, width), np.float32)) for width in (3, 4))
+    merged = merge(replace(ball, meshes=both), [0, 0], False)
+    np.testing.assert_array_equal(merged.colors, np.ones((2 * count, 3)))

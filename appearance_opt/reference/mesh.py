@@ -187,7 +187,8 @@ def _complete(mesh: Mesh, need_tangents: bool, need_colors: bool) -> MergedMesh:
     positions, faces = mesh.positions, mesh.faces
     normals = mesh.normals
     uvs = np.zeros((len(positions), 2), np.float32) if mesh.uvs is None else mesh.uvs
-    colors = mesh.colors if mesh.colors is not None else np.ones((len(positions), 3), np.float32)
+    # drawn opaque: alpha of some meshes and not of others makes no difference
+    colors = np.ones((len(positions), 3), np.float32) if mesh.colors is None else mesh.colors[:, :3]
     tangents = mesh.tangents
     if normals is None:
         index, faces, normals = split_where_cancelled(positions, faces, summed_normals(positions, faces))
