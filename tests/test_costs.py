@@ -10,10 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from appearance_opt.asset import load, uv_frames, validate
+from appearance_opt.asset import load, usd_read, uv_frames, validate
 from appearance_opt.asset.gltf_accessors import Document
 from appearance_opt.asset.gltf_read import _Reader
 from appearance_opt.asset.notes import LINES, Notes
+from appearance_opt.asset.rows import count_unique_rows, ranked, unique_rows
 from appearance_opt.asset.types import Asset, Material, Mesh
 from appearance_opt.asset.validate import Validation
 from tests.conftest import grid_sphere
@@ -187,3 +188,61 @@ def test_texture_frames_take_time_in_proportion_to_materials(place) -> None:
         place(meshes, {id(m): {} for m in materials}, lambda text: None)
         reads.append(meshes.reads)
     assert reads[1] == 10 * reads[0]
+
+
+def test_rows_are_found_equal_as_numpy_finds_them() -> None:
+    rng = np.random.default_rng(1)
+    for top in (3, 2**40):  # three numbers of 41 bits do not fit into one of 62
+        rows = rng.integers(0, 3, (500, 3)) * (top // 3)
+        expected, inverse = np.unique(rows, axis=0, return_inverse=True)
+        first, kind = unique_rows(rows)
+        np.testing.assert_array_equal(rows[first], expected)
+        np.testing.assert_array_equal(kind, inverse.ravel())
+        assert count_unique_rows(rows) == len(expected)
+        values = rows - 1.5
+        np.testing.assert_array_equal(np.unique(values, axis=0), values[unique_rows(ranked(values))[0]])
+
+
+USD_INSTANCES = """#usda 1.0
+( upAxis = "Y"
+  metersPerUnit = 1 )
+def Xform "Shape"
+{
+%s
+}
+%s
+def PointInstancer "Many"
+{
+    rel prototypes = </Shape/T>
+    int[] protoIndices = [%s]
+    point3f[] positions = [%s]
+}
+"""
+
+
+def test_instances_of_usd_are_read_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    tent = """def Mesh "T"
+    {
+        int[] faceVertexCounts = [3, 3]
+        int[] faceVertexIndices = [0, 1, 2, 2, 1, 3]
+        point3f[] points = [(0, 0, 0), (1, 0, 0), (0, 1, 0), (1, 1, 1)]
+        uniform token subdivisionScheme = "none"
+    }"""
+    copies = "\n".join(
+        f'def Xform "C{k}" (\n instanceable = true\n references = </Shape>\n)\n'
+        f"{{\n double3 xformOp:translate = ({k}, 5, 0)\n"
+        ' uniform token[] xformOpOrder = ["xformOp:translate"]\n}'
+        for k in range(20)
+    )
+    count = 30
+    where = ", ".join(f"({k}, 0, 0)" for k in range(count))
+    path = tmp_path / "x.usda"
+    path.write_text(USD_INSTANCES % (tent, copies, ", ".join(["0"] * count), where))
+    calls = count_calls(monkeypatch, usd_read._Reader, "_split")
+    asset = load(path)
+    assert calls.total() == 3  # of the shape itself, of the twenty copies, of the thirty instances
+    assert [len(m.faces) for m in asset.meshes] == [2] * 21 + [60]
+    np.testing.assert_allclose([m.positions[0, 0] for m in asset.meshes[1:21]], np.arange(20))
+    alone, instances = asset.meshes[0], asset.meshes[-1]
+    every = instances.normals.reshape(count, -1, 3)
+    np.testing.assert_allclose(every, np.broadcast_to(alone.normals, every.shape), atol=1e-6)

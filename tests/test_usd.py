@@ -55,7 +55,9 @@ def test_point_instancers_draw_their_prototypes_where_they_say(tmp_path: Path) -
     }}
 }}""",
     )
-    lows = sorted(tuple(m.positions.min(axis=0)) for m in load(path).meshes)
+    meshes = load(path).meshes
+    assert [(m.name, len(m.faces)) for m in meshes] == [("a", 2), ("inside", 1)]  # one mesh holds all its places
+    lows = sorted(tuple(p.min(axis=0)) for m in meshes for p in m.positions[m.faces])
     assert lows == [(10, 0, 5), (20, 6, 5), (30, 0, 5)]
 
 

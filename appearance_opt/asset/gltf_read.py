@@ -14,9 +14,10 @@ from appearance_opt.asset.gltf_accessors import Document
 from appearance_opt.asset.gltf_draco import DRACO, Compressed
 from appearance_opt.asset.gltf_materials import READ_EXTENSIONS, MaterialReader
 from appearance_opt.asset.gltf_meshopt import MESHOPT
-from appearance_opt.asset.gltf_nodes import INSTANCING, Nodes, Placement
+from appearance_opt.asset.gltf_nodes import INSTANCING, Nodes
 from appearance_opt.asset.normals import unit
 from appearance_opt.asset.origin import settle
+from appearance_opt.asset.placement import placed
 from appearance_opt.asset.types import Asset, Mesh
 from appearance_opt.errors import InputError
 
@@ -101,8 +102,8 @@ class _Reader:
             name = node.get("name") or mesh.get("name") or f"mesh{node['mesh']}"
             for k, primitive in enumerate(mesh["primitives"]):
                 weights = node.get("weights", mesh.get("weights", ()))
-                placed = self._primitive(primitive, k, node, world, name if k == 0 else f"{name}.{k}", weights)
-                meshes += [] if placed is None else [placed]
+                found = self._primitive(primitive, k, node, world, name if k == 0 else f"{name}.{k}", weights)
+                meshes += [] if found is None else [found]
         for child in node.get("children", []):
             self._visit(child, world, meshes, seen | {index})
 
@@ -125,7 +126,7 @@ class _Reader:
         if "skin" in node and "JOINTS_0" in primitive["attributes"]:
             source = _Source(self.document, primitive, weights)
             place = self.nodes.skinned(node["skin"], primitive["attributes"], source.read)
-            return _placed(self._read(primitive, source), place, name)
+            return placed(self._read(primitive, source), place, name)
         key = (node["mesh"], k, tuple(weights))
         local = self._local.get(key)
         if local is None:
@@ -133,7 +134,7 @@ class _Reader:
             local = self._read(primitive, _Source(self.document, primitive, weights, shared))
             if self._uses[node["mesh"]] > 1:
                 self._local[key] = local
-        return _placed(local, self.nodes.placement(node, world), name)
+        return placed(local, self.nodes.placement(node, world), name)
 
     def _read(self, primitive: dict[str, Any], source: _Source) -> Mesh:
         """A primitive in its own frame, in double precision."""
@@ -214,29 +215,6 @@ class _Source:
         return out
 
 
-def _placed(mesh: Mesh, place: Placement, name: str) -> Mesh:
-    """A mesh at all its places in the world, positions still in double precision."""
-    vertices = len(mesh.positions)
-    normals, tangents = mesh.normals, mesh.tangents
-    if normals is not None:
-        normals = _float(_normalized(place.normals(normals)))
-    if tangents is not None:
-        # a reflection turns cross(normal, tangent) over, but not the bitangent
-        negative = place.repeated(tangents[:, 3:4] < 0)
-        w = np.where(negative != place.mirrored(vertices)[:, None], -1, 1)
-        tangents = _float(np.concatenate([_normalized(place.directions(tangents[:, :3])), w], axis=1))
-    return Mesh(
-        positions=place.points(mesh.positions),  # type: ignore[arg-type]
-        faces=place.faces(mesh.faces, vertices),
-        normals=normals,
-        uvs=place.repeated(mesh.uvs),
-        tangents=tangents,
-        colors=place.repeated(mesh.colors),
-        material=mesh.material,
-        name=name,
-    )
-
-
 def _in_range(mesh: Mesh) -> bool:
     """Do all its corners exist? (If not, ``repair`` refuses it, and counts them.)"""
     return not len(mesh.faces) or (mesh.faces.min() >= 0 and mesh.faces.max() < len(mesh.positions))
@@ -272,10 +250,6 @@ def _triangles(indices: NDArray, mode: int) -> NDArray:
     strip = np.stack([indices[:n], indices[1 : n + 1], indices[2 : n + 2]], axis=1)
     strip[1::2] = strip[1::2, [1, 0, 2]]
     return strip
-
-
-def _normalized(v: NDArray) -> NDArray:
-    return v / np.maximum(np.linalg.norm(v, axis=1, keepdims=True), 1e-30)
 
 
 def _float(v: NDArray | None) -> NDArray[np.float32] | None:

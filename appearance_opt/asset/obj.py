@@ -12,6 +12,7 @@ from appearance_opt.asset.mtl import MaterialReader
 from appearance_opt.asset.origin import settle
 from appearance_opt.asset.paths import read_text
 from appearance_opt.asset.polygons import Polygons, triangulate
+from appearance_opt.asset.rows import unique_rows
 from appearance_opt.asset.types import Asset, Material, Mesh, srgb_to_linear
 from appearance_opt.errors import InputError, MissingFileError
 
@@ -120,7 +121,8 @@ class _Parser:
     def _mesh(self, name: str, has_uv: bool, has_normal: bool, polygons: list[list[tuple[int, int, int]]]) -> Mesh:
         indices = np.array([c for p in polygons for c in p], np.int64)
         indices[:, [k for k, has in ((1, has_uv), (2, has_normal)) if not has]] = -1
-        used, index = np.unique(indices, axis=0, return_inverse=True)
+        of_kind, index = unique_rows(indices + 1)
+        used = indices[of_kind]
         for k, (what, rows) in enumerate((("position", self.positions), ("uv", self.uvs), ("normal", self.normals))):
             if used[:, k].max() >= len(rows) and used[:, k].max() >= 0:
                 raise InputError(
@@ -130,7 +132,6 @@ class _Parser:
         if any(len(v) < 3 for v in vertices):
             raise InputError(f"{self.path}: a vertex has fewer than three coordinates")
         positions = np.array([v[:3] for v in vertices], np.float64)
-        index = index.ravel()
         corners, _ = triangulate(Polygons(np.array([len(p) for p in polygons]), index), positions)
         has_color = all(len(v) == 6 for v in vertices)
         uvs = np.array([self.uvs[i] for i in used[:, 1]], np.float32) if has_uv else None

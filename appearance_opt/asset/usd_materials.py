@@ -76,6 +76,11 @@ class MaterialReader:
             self.note(f"'{prim.GetPath()}': its materials read texture coordinates of their own ({', '.join(names)})")
         return names
 
+    def bound_keys(self, prim: Any) -> tuple[str, ...]:
+        """What tells the materials of a mesh and its subsets from those of others."""
+        bound = (self._bound_prim(wearer) for wearer in (prim, *self._subsets(prim)))
+        return tuple(_key(material) if material else "" for material in bound)
+
     def _subsets(self, prim: Any) -> list[Any]:
         from pxr import UsdShade
 
@@ -143,7 +148,7 @@ class MaterialReader:
     def _bound(self, prim: Any) -> Material:
         material = self._bound_prim(prim)
         if material:
-            key = str(material.GetPath())
+            key = _key(material)
             if key not in self._materials:
                 self._in_tiles = False
                 self._materials[key] = self._read(material)
@@ -372,6 +377,12 @@ def _opaque(pixels: NDArray) -> NDArray:
     """Pixels (H, W, 3) with an alpha of 1."""
     one = np.iinfo(pixels.dtype).max if pixels.dtype.kind == "u" else 1
     return np.concatenate([pixels, np.full_like(pixels[..., :1], one)], axis=2)
+
+
+def _key(material: Any) -> str:
+    """The path of a material, the same for the copies of an instance."""
+    prim = material.GetPrim()
+    return str((prim.GetPrimInPrototype() if prim.IsInstanceProxy() else prim).GetPath())
 
 
 def _input(shader: Any, key: str, default: Any) -> tuple[Any, Any, str]:

@@ -12,10 +12,12 @@ import numpy as np
 from appearance_opt.asset import usd_shapes, uv_frames
 from appearance_opt.asset.alpha import OPAQUE
 from appearance_opt.asset.companions import Companions
-from appearance_opt.asset.normals import accumulate, unit
+from appearance_opt.asset.normals import accumulate, split_where_cancelled, summed_normals, unit
 from appearance_opt.asset.origin import settle
 from appearance_opt.asset.paths import check_inside, read_bytes
+from appearance_opt.asset.placement import Placement, placed
 from appearance_opt.asset.polygons import Polygons, triangulate
+from appearance_opt.asset.rows import ranked, unique_rows
 from appearance_opt.asset.subdivide import Sharpness, catmull_clark
 from appearance_opt.asset.types import Asset, Mesh
 from appearance_opt.asset.usd_guard import check_usd
@@ -125,6 +127,7 @@ class _Reader:
         # the first frame of what is animated
         self.time = Usd.TimeCode.EarliestTime()
         self.cache = UsdGeom.XformCache(self.time)
+        self._read: dict[tuple[str, ...], list[Mesh]] = {}
 
     def asset(self) -> Asset:
         from pxr import Usd, UsdGeom
@@ -136,9 +139,8 @@ class _Reader:
                 prims.PruneChildren()  # its prototypes are drawn where it says
                 meshes += self._instances(prim)
             elif prim.IsA(UsdGeom.Gprim) and self._shown(prim):
-                geometry = self._geometry(prim)
-                if geometry is not None:
-                    meshes += self._split(prim, geometry, self._to_world(prim))
+                place = self._place([np.array(self._to_world(prim))])
+                meshes += [placed(part, place, part.name) for part in self._parts(prim)]
         meshes = self.materials.in_one_frame(meshes, self.keep_layout)
         meshes, origin = settle(meshes, self.note)
         return Asset(tuple(meshes), self.path.stem, self.companions.notes.lines(), origin=origin)
@@ -183,7 +185,8 @@ class _Reader:
         shown = instancer.ComputeMaskAtTime(self.time)
         number = number[np.array(shown, bool)] if len(shown) else number
         transforms = instancer.ComputeInstanceTransformsAtTime(self.time, self.time)
-        world = self.cache.GetLocalToWorldTransform(prim)
+        each = np.array(transforms, np.float64).reshape(-1, 4, 4)
+        world = np.array(self.cache.GetLocalToWorldTransform(prim))
         meshes: list[Mesh] = []
         for k, target in enumerate(instancer.GetPrototypesRel().GetForwardedTargets()):
             root = self.stage.GetPrimAtPath(target)
@@ -194,13 +197,35 @@ class _Reader:
             for part in Usd.PrimRange(root, Usd.TraverseInstanceProxies()):
                 if part.IsA(UsdGeom.PointInstancer):
                     self.note(f"'{part.GetPath()}' ignored: it is a prototype of another PointInstancer")
-                geometry = self._geometry(part) if part.IsA(UsdGeom.Gprim) and self._shown(part) else None
-                if geometry is None:
+                if not part.IsA(UsdGeom.Gprim) or not self._shown(part):
                     continue
-                local = self._to_world(part) * back
-                for i in np.flatnonzero(number == k):
-                    meshes += self._split(part, geometry, local * transforms[int(i)] * world)
+                local = np.array(self._to_world(part) * back)
+                place = self._place(local @ each[number == k] @ world)
+                meshes += [placed(_with_normals(one), place, one.name) for one in self._parts(part)]
         return meshes
+
+    def _place(self, to_world: Any) -> Placement:
+        """Where the copies of a mesh are, in metres, Y up; ``to_world``: (P, 4, 4) for rows, as USD has them."""
+        metres = np.eye(4)
+        metres[:3, :3] = self.to_metres
+        return Placement(metres @ np.asarray(to_world).transpose(0, 2, 1))
+
+    def _parts(self, prim: Any) -> list[Mesh]:
+        """The triangles of a mesh or a shape in its own frame, in double precision, one mesh for each material. What
+        instances share is read once."""
+        key = self._shared(prim)
+        if key is None:
+            return self._split(prim)
+        if key not in self._read:
+            self._read[key] = self._split(prim)
+        return self._read[key]
+
+    def _shared(self, prim: Any) -> tuple[str, ...] | None:
+        """What instances have in common that look alike: their prim in the prototype, and what is bound to them. None
+        for what is no instance."""
+        if not prim.IsInstanceProxy():
+            return None
+        return str(prim.GetPrimInPrototype().GetPath()), *self.materials.bound_keys(prim)
 
     def _geometry(self, prim: Any) -> _Geometry | None:
         """A mesh or a shape in its own frame; None, with a note, if it is something else."""
@@ -319,19 +344,16 @@ class _Reader:
             del out["opacity"]
         return out
 
-    def _split(self, prim: Any, geometry: _Geometry, to_world: Any) -> list[Mesh]:
-        """Triangles with one index for all attributes, one mesh per material."""
+    def _split(self, prim: Any) -> list[Mesh]:
+        """Triangles with one index for all attributes, one mesh per material, in the frame of a mesh or a shape."""
+        geometry = self._geometry(prim)
+        if geometry is None:
+            return []
         values, face_ids = geometry.values, geometry.face_ids
         points, polygons = values["points"]
         corners, face = triangulate(polygons, points)
         if geometry.flipped:
             corners = corners[:, ::-1]
-        matrix = np.array(to_world)
-        linear = matrix[:3, :3] @ self.to_metres.T
-        offset = matrix[3, :3] @ self.to_metres.T
-        if np.linalg.det(linear) < 0:
-            corners = corners[:, ::-1]
-        cofactor = np.linalg.inv(linear).T if abs(np.linalg.det(linear)) > 0 else np.eye(3)
         meshes = []
         if len(geometry.holes):
             drawn = ~np.isin(face_ids[face], geometry.holes)
@@ -341,22 +363,19 @@ class _Reader:
             rows = np.stack([values[n][1].indices[corners[chosen]].ravel() for n in names], axis=1)
             if not len(rows):
                 continue
-            used, index = np.unique(rows, axis=0, return_inverse=True)
+            of_kind, index = unique_rows(rows)
+            used = rows[of_kind]
             got = {n: values[n][0][used[:, k]] for k, n in enumerate(names)}
             uvs = uv_frames.stacked([got.get(_UVS + n) for n in uv_names])
             colors = got.get("colors")
             if "opacity" in got:
                 colors = np.ones((len(used), 3)) if colors is None else colors
                 colors = np.concatenate([colors, got["opacity"]], axis=1)
-            normals = got.get("normals")
-            if normals is not None:
-                normals = normals @ cofactor
-                normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
             meshes.append(
                 Mesh(
-                    positions=got["points"] @ linear + offset,  # in double precision until settled
+                    positions=got["points"],
                     faces=index.reshape(-1, 3).astype(np.int32),
-                    normals=None if normals is None else normals.astype(np.float32),
+                    normals=got.get("normals"),
                     uvs=None if uvs is None else uvs.astype(np.float32),
                     colors=None if colors is None else colors.astype(np.float32),
                     material=material,
@@ -374,8 +393,19 @@ def _facets(points: NDArray, polygons: Polygons, flipped: bool) -> tuple[NDArray
     total = np.zeros((len(polygons.counts), 3))
     accumulate(total, face, np.cross(corner - first, corner[polygons.next()] - first))
     normals = unit(-total if flipped else total).astype(np.float32)
-    values, index = np.unique(normals, axis=0, return_inverse=True)
-    return values.astype(np.float64), Polygons(polygons.counts, index.ravel()[face])
+    of_kind, index = unique_rows(ranked(normals))
+    return normals[of_kind].astype(np.float64), Polygons(polygons.counts, index[face])
+
+
+def _with_normals(mesh: Mesh) -> Mesh:
+    """A mesh that has normals, so that copies of it which touch are not smoothed across."""
+    if mesh.normals is not None:
+        return mesh
+    index, faces, normals = split_where_cancelled(
+        mesh.positions, mesh.faces, summed_normals(mesh.positions, mesh.faces)
+    )
+    uvs, colors = (None if v is None else v[index] for v in (mesh.uvs, mesh.colors))
+    return replace(mesh, positions=mesh.positions[index], faces=faces, normals=normals, uvs=uvs, colors=colors)
 
 
 def _expand(value: Any, how: str, polygons: Polygons, width: int) -> tuple[NDArray, Polygons] | None:
@@ -394,9 +424,8 @@ def _expand(value: Any, how: str, polygons: Polygons, width: int) -> tuple[NDArr
         return v, Polygons(polygons.counts, np.repeat(np.arange(len(v)), polygons.counts))
     if how == "faceVarying" and len(v) == corners:
         # corners of one point with one value are one vertex: seams are where values differ
-        rows = np.concatenate([polygons.indices[:, None].astype(np.float64), v], axis=1)
-        unique, index = np.unique(rows, axis=0, return_inverse=True)
-        return unique[:, 1:], Polygons(polygons.counts, index.ravel())
+        used, index = unique_rows(np.concatenate([polygons.indices[:, None], ranked(v)], axis=1))
+        return v[used], Polygons(polygons.counts, index)
     return None
 
 

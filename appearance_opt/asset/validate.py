@@ -11,6 +11,7 @@ from appearance_opt.asset.alpha import settled
 from appearance_opt.asset.batch import WIDTHS, Batch
 from appearance_opt.asset.normals import unit, vertex_normals, weld
 from appearance_opt.asset.notes import Notes
+from appearance_opt.asset.rows import count_unique_rows
 from appearance_opt.asset.types import Asset, Mesh
 from appearance_opt.errors import InputError
 
@@ -27,6 +28,9 @@ could address a texel."""
 
 LIMITS: dict[str, tuple[float, float]] = {"uvs": (-MAX_UV, MAX_UV), "colors": (0.0, 1.0)}
 """Least and greatest values of attributes that mean something."""
+
+BAND = 1 << 18
+"""Faces looked at at once: more take no less time, and memory."""
 
 
 @dataclass(frozen=True)
@@ -48,9 +52,14 @@ class Validation:
 def inspected(asset: Asset, path: str) -> tuple[Validation, Asset]:
     """(counts, the asset after ``repair``): of what that mends as it is in the file, of all else as it is left."""
     mended = repair(asset, path)
-    found = validate(asset)
-    counted = {name: getattr(found, name) for name in _MENDED}
-    return replace(validate(mended), **counted), mended
+    found, left = validate(asset), mended.meshes
+    if len(left) < len(asset.meshes) or any(_reshaped(m, n) for m, n in zip(asset.meshes, left, strict=True)):
+        found = replace(validate(mended), **{name: getattr(found, name) for name in _MENDED})
+    return found, mended
+
+
+def _reshaped(mesh: Mesh, mended: Mesh) -> bool:
+    return any(getattr(mesh, name) is not getattr(mended, name) for name in ("positions", "faces", "uvs"))
 
 
 _MENDED = ("non_finite_positions", "indices_out_of_range", "degenerate_faces", "unreferenced_vertices")
@@ -73,7 +82,7 @@ def validate(asset: Asset) -> Validation:
         non_finite_positions=int((~np.isfinite(positions).all(axis=1)).sum()),
         indices_out_of_range=int(bad_index.sum()),
         degenerate_faces=int(_degenerate(positions, faces).sum()),
-        duplicate_faces=len(welded) - len(np.unique(np.sort(welded, axis=1), axis=0)),
+        duplicate_faces=len(welded) - count_unique_rows(np.sort(welded, axis=1)),
         unreferenced_vertices=int((~used).sum()),
         meshes_without_uvs=int((~batch.have("uvs")).sum()),
         boundary_edges=int((uses == 1).sum()),
@@ -256,8 +265,12 @@ def _compacted(mesh: Mesh, used: NDArray) -> Mesh:
 
 
 def _degenerate(positions: NDArray, faces: NDArray) -> NDArray[np.bool_]:
-    """Faces with two corners at the same place, or without area in double precision."""
-    p = np.asarray(positions, np.float64)
-    with np.errstate(invalid="ignore", over="ignore"):
-        cross = np.cross(p[faces[:, 1]] - p[faces[:, 0]], p[faces[:, 2]] - p[faces[:, 0]])
-        return ~(np.abs(cross).max(axis=1, initial=0) > 0) & np.isfinite(cross).all(axis=1)
+    """(F,) faces with two corners at the same place, or without area in double precision."""
+    out = np.empty(len(faces), bool)
+    for start in range(0, len(faces), BAND):
+        a, b, c = positions[faces[start : start + BAND].T].astype(np.float64)
+        with np.errstate(invalid="ignore", over="ignore"):
+            (ux, uy, uz), (vx, vy, vz) = (b - a).T, (c - a).T
+            flat = (uy * vz == uz * vy) & (uz * vx == ux * vz) & (ux * vy == uy * vx)
+        out[start : start + BAND] = flat
+    return out
