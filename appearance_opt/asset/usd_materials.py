@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -10,11 +10,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from appearance_opt.asset import images, specular_glossiness, udim, uv_frames
-from appearance_opt.asset.materialx import load_materialx
+from appearance_opt.asset.materialx import SURFACES, read_surface
+from appearance_opt.asset.materialx_file import find_surface
 from appearance_opt.asset.packing import pack_orm, with_alpha
 from appearance_opt.asset.paths import check_inside
 from appearance_opt.asset.specular_glossiness import Specular
 from appearance_opt.asset.types import Material, Mesh, Texture
+from appearance_opt.asset.usd_networks import UsdNode
+from appearance_opt.asset.uv_frames import Place
 from appearance_opt.errors import MissingFileError
 
 if TYPE_CHECKING:
@@ -104,7 +107,7 @@ class MaterialReader:
         if not materials:
             return not self._unresolved(prim)
         readers = (UsdShade.Shader(n) for m in materials for n in _descendants(m.GetPrim()))
-        return any(r and str(_value(r.GetInput("varname"))) == name for r in readers)
+        return any(r and _reads_primvar(r, name) for r in readers)
 
     def _on_mesh(self, material: Material, double: bool, covers_in_part: bool) -> Material:
         """The material with what in USD the mesh says: are both sides of it seen, or one, and does it
@@ -148,25 +151,25 @@ class MaterialReader:
     def _bound(self, prim: Any) -> Material:
         material = self._bound_prim(prim)
         if material:
-            key = _key(material)
-            if key not in self._materials:
-                self._in_tiles = False
-                self._materials[key] = self._read(material)
-                if self._in_tiles:
-                    self.tiles[id(self._materials[key])] = partial(self._read_tile, material)
-            return self._materials[key]
+            return self._read_once(_key(material), partial(self._read, material))
         name = self._unresolved(prim)
         if name is not None:
-            if name not in self._materials:
-                self._materials[name] = self._from_materialx(name)
-            return self._materials[name]
+            return self._read_once(name, partial(self._from_materialx, name))
         return self._materials.setdefault("", Material(name="default", base_color=(1.0, 1.0, 1.0), roughness=0.5))
 
-    def _read_tile(self, material: Any, tile: Tile) -> Material:
+    def _read_once(self, key: str, read: Callable[[], Material]) -> Material:
+        if key not in self._materials:
+            self._in_tiles = False
+            self._materials[key] = read()
+            if self._in_tiles:
+                self.tiles[id(self._materials[key])] = partial(self._read_tile, read)
+        return self._materials[key]
+
+    def _read_tile(self, read: Callable[[], Material], tile: Tile) -> Material:
         read_before = dict(self._pixels)
         self._tile = tile
         try:
-            return self._read(material)
+            return read()
         finally:
             self._tile, self._pixels = None, read_before
 
@@ -177,20 +180,56 @@ class MaterialReader:
                 if not dependency.endswith(".mtlx") or not layer.realPath:
                     continue
                 file = self.companions.find(str(Path(layer.realPath).resolve().parent / dependency), self.path)
-                found = load_materialx(file, name, self.companions)
+                surface = find_surface(file, name, self.companions, partial(self._read_beside, file), self._fitted)
+                found = None if surface is None else read_surface(surface, name, self.note)
                 if found is not None:
-                    self.note(f"material '{name}' read from {file.name}: subsurface and coat ignored")
-                    return found
+                    self.note(f"material '{name}': read from {file.name}")
+                    self._keep(*found)
+                    return found[0]
         self.note(f"material '{name}' does not exist: default material used")
         return Material(name=name)
+
+    def _read_beside(self, owner: Path, text: str) -> NDArray | None:
+        """Pixels of a file that a document names, see ``_read_image``."""
+
+        def read(name: str) -> NDArray:
+            path = str(self.companions.find(name, owner))
+            if path not in self._pixels:
+                self._pixels[path] = images.read(Path(path))
+            return self._pixels[path]
+
+        if not udim.is_tiled(text):
+            return self.companions.read(lambda: read(text))
+        self._in_tiles = True
+        return None if self._tile is None else udim.read_tile(text, self._tile, owner, self.companions, read)
+
+    def _fitted(self, texture: Texture, text: str) -> Texture:
+        if self._tile is None or not udim.is_tiled(text):
+            return texture
+        return udim.fitted(texture, self._tile, self.note)
 
     def _read(self, material: Any) -> Material:
         name = str(material.GetPrim().GetName())
         shader = material.ComputeSurfaceSource()[0]
-        if not shader or str(shader.GetIdAttr().Get()) != "UsdPreviewSurface":
-            self.note(f"material '{name}' has no UsdPreviewSurface: default material used")
-            return Material(name=name)
+        if shader and str(shader.GetIdAttr().Get()) == "UsdPreviewSurface":
+            return self._preview(shader, name)
+        for other in (shader, material.ComputeSurfaceSource("mtlx")[0]):
+            node = UsdNode(other, self._read_input, self._fitted_input) if other else None
+            found = read_surface(node, name, self.note) if node is not None and node.category in SURFACES else None
+            if found is not None:
+                self._keep(*found)
+                return found[0]
+        self.note(f"material '{name}': {_what_it_has(material)}: default material used")
+        return Material(name=name)
 
+    def _read_input(self, source: Any) -> NDArray | None:
+        text, there = _file(source)
+        return self._read_image(text, there) if text else None
+
+    def _fitted_input(self, texture: Texture, source: Any) -> Texture:
+        return self._fitted(texture, _file(source)[0])
+
+    def _preview(self, shader: Any, name: str) -> Material:
         of = partial(_input, shader)
         color, color_map, _ = of("diffuseColor", (0.18, 0.18, 0.18))
         roughness, rough_map, rough_channel = of("roughness", 0.5)
@@ -321,9 +360,7 @@ class MaterialReader:
             pixels = pixels[..., _CHANNEL[channel]][..., None]
         wraps = tuple(_WRAPS.get(str(_value(node.GetInput(k))), "repeat") for k in ("wrapS", "wrapT"))
         texture = Texture(np.ascontiguousarray(pixels), space, wraps)  # type: ignore[arg-type]
-        if self._tile is None or not udim.is_tiled(text):
-            return texture
-        return udim.fitted(texture, self._tile, self.note)
+        return self._fitted(texture, text)
 
     def _read_image(self, text: str, there: bool) -> NDArray | None:
         """Pixels of a file. None if it is missing and that is to be ignored, or if it is one in tiles and none is
@@ -348,6 +385,22 @@ class MaterialReader:
             else:
                 self._pixels[text] = images.read(self.companions.find(text, self.path))
         return self._pixels[text]
+
+
+def _what_it_has(material: Any) -> str:
+    """The surface of a material that is not read, by the names that its renderers know it by."""
+    from pxr import UsdShade
+
+    kinds = []
+    for output in material.GetSurfaceOutputs():
+        for attribute in UsdShade.Utils.GetValueProducingAttributes(output):
+            shader = UsdShade.Shader(attribute.GetPrim())
+            inside = (shader.GetPrim().GetAttribute(f"info:{k}:sourceAsset:subIdentifier") for k in ("mdl", "osl"))
+            named = (a.Get() for a in inside if a)
+            kinds.append(str(shader.GetIdAttr().Get() or next(named, None) or attribute.GetPrim().GetTypeName()))
+    if not kinds:
+        return "it has no surface shader"
+    return f"its surface {', '.join(repr(k) for k in dict.fromkeys(kinds))} is not understood"
 
 
 def _file(source: Any) -> tuple[str, bool]:
@@ -422,17 +475,6 @@ def _vector(node: Any, key: str, default: float) -> Any:
     return (default,) * 4 if value is None else tuple(float(x) for x in value)
 
 
-@dataclass(frozen=True)
-class Place:
-    """Where a texture reads: at ``matrix`` (2, 3) times the coordinates ``primvar``."""
-
-    primvar: str = "st"
-    matrix: NDArray[np.float64] = field(default_factory=lambda: uv_frames.affine(None))
-
-    def equals(self, other: Place) -> bool:
-        return self.primvar == other.primvar and np.allclose(self.matrix, other.matrix)
-
-
 def _place(node: Any) -> Place:
     """Where a sampler reads, after the transforms before it."""
     from pxr import UsdShade
@@ -476,6 +518,12 @@ def _constant(source: Any, node: Any, output: str, default: Any) -> Any:
     if fallback is None:
         return default
     return fallback[_CHANNEL[output]] if output in _CHANNEL else tuple(fallback)[:3]
+
+
+def _reads_primvar(shader: Any, name: str) -> bool:
+    names = (str(_value(shader.GetInput(n))) for n in ("varname", "geomprop"))
+    is_color = name == "displayColor" and str(shader.GetIdAttr().Get() or "").startswith("ND_geomcolor")
+    return is_color or name in names
 
 
 def _descendants(prim: Any) -> Any:

@@ -73,6 +73,21 @@ class Frame:
 
 
 @dataclass(frozen=True)
+class Place:
+    """The same for a set of coordinates that has a name, ``primvar``, and no number yet."""
+
+    primvar: str = "st"
+    matrix: NDArray[np.float64] = field(default_factory=lambda: affine(None))
+
+    def equals(self, other: Place) -> bool:
+        return self.primvar == other.primvar and np.allclose(self.matrix, other.matrix)
+
+    def then(self, matrix: NDArray) -> Place:
+        """The place after one more transform."""
+        return replace(self, matrix=composed(matrix, self.matrix))
+
+
+@dataclass(frozen=True)
 class Resampled:
     """Textures under one frame. ``uvs``: (V, 2) of each mesh; ``textures``: by field name; ``what``: what they now
     share, and what that costs; ``keeps_tangents``: do the meshes' tangents still fit the normal map?"""
