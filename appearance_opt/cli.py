@@ -396,7 +396,9 @@ def _print_result(out: Path, result: Any, folder: Path | None) -> None:
         print(f"note: {note}", file=sys.stderr)
     curve = result.fit.curve
     quality = f", held-out PSNR {curve[0].psnr:.2f} -> {max(p.psnr for p in curve):.2f} dB" if curve else ""
-    print(f"{out}: {result.triangles} of {result.source_triangles} triangles, {result.seconds['total']:.1f} s{quality}")
+    kept = f" and {result.kept_triangles} kept as they are" if result.kept_triangles else ""
+    counts = f"{result.triangles} of {result.source_triangles} triangles{kept}"
+    print(f"{out}: {counts}, {result.seconds['total']:.1f} s{quality}")
     if folder is not None and (folder / "report.html").is_file():
         print(f"report: {folder / 'report.html'}")
 

@@ -218,4 +218,4 @@ def test_colours_with_and_without_alpha_are_drawn_together() -> None:
     count = len(mesh.positions)
     both = tuple(replace(mesh, colors=np.ones((count, width), np.float32)) for width in (3, 4))
     merged = merge(replace(ball, meshes=both), [0, 0], False)
-    np.testing.assert_array_equal(merged.colors, np.ones((2 * count, 3)))
+    np.testing.assert_array_equal(merged.colors, np.ones((2 * count, 4)))

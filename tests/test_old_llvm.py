@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import drjit as dr
@@ -35,6 +36,12 @@ def baked(asset: Asset, out: Path, **values: object) -> None:
     run(asset, low, out / "y.glb", bake_options(**{**QUICK, **values}))
 
 
+def veiled(asset: Asset) -> Asset:
+    """All of it half transparent."""
+    meshes = (replace(m, material=replace(m.material, alpha_mode="blend", opacity=0.5)) for m in asset.meshes)
+    return replace(asset, meshes=tuple(meshes))
+
+
 JOBS: dict[str, Callable[[Asset, Path], object]] = {
     "decimated, with a report": lambda asset, out: simplified(asset, out, report=True),
     "a sphere": lambda asset, out: simplified(asset, out, init="sphere", steps=8),
@@ -44,6 +51,7 @@ JOBS: dict[str, Callable[[Asset, Path], object]] = {
     ),
     "a joint bake": lambda asset, out: baked(asset, out, joint=True, subdivision=(1,)),
     "compared": lambda asset, out: compare(asset, asset),
+    "compared, transparent": lambda asset, out: compare(veiled(asset), asset, resolution=64),
 }
 
 

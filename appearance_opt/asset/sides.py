@@ -25,20 +25,25 @@ def single_sided(meshes: tuple[Mesh, ...]) -> NDArray[np.bool_]:
     return np.repeat([not m.material.double_sided for m in meshes], [len(m.faces) for m in meshes])
 
 
-def culled(positions: NDArray, faces: NDArray, single: NDArray[np.bool_] | None) -> NDArray[np.bool_] | None:
+def culled(
+    positions: NDArray, faces: NDArray, single: NDArray[np.bool_] | None, passing: NDArray[np.bool_] | None = None
+) -> NDArray[np.bool_] | None:
     """(F,) faces that are not to be seen from behind although someone outside might look at their backs; None if there
     are none, so that nothing has to be done about it.
 
     ``single``: see ``single_sided``; None for none. Of a closed part whose faces look outward nobody sees a back: every
     edge has two faces that run along it in opposite directions, and its volume is positive (more than ``THIN``). Where
-    such a part passes through itself backs can show; they are drawn.
+    such a part passes through itself backs can show; they are drawn. ``passing`` (F,): faces that light passes, through
+    which backs are seen, and which close no part; None for none.
     """
     if single is None or not single.any():
         return None
     first, place = weld(np.asarray(positions))
     f = place[np.asarray(faces)].astype(np.int64)
     part = _parts(f, len(first))
-    out = single & ~_solid(np.asarray(positions, np.float64)[first], f, part)[part]
+    blocking = np.ones(len(f), bool) if passing is None else ~passing
+    solid = _solid(np.asarray(positions, np.float64)[first], f[blocking], part[blocking], int(part.max()) + 1)
+    out = single & ~(solid[part] & blocking)
     return out if out.any() else None
 
 
@@ -49,10 +54,9 @@ def _parts(faces: NDArray, vertices: int) -> NDArray[np.int32]:
     return connected_components(graph, directed=False)[1][faces[:, 0]]
 
 
-def _solid(positions: NDArray, faces: NDArray, part: NDArray) -> NDArray[np.bool_]:
-    """By part: is it closed, do its faces look outward, and is there room inside? Faces whose corners coincide are
-    passed over."""
-    count = int(part.max()) + 1
+def _solid(positions: NDArray, faces: NDArray, part: NDArray, count: int) -> NDArray[np.bool_]:
+    """By part, of ``count``: is it closed, do its faces look outward, and is there room inside? Faces whose corners
+    coincide are passed over."""
     proper = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
     faces, part = faces[proper], part[proper]
     start, end = faces.ravel(), np.roll(faces, -1, axis=1).ravel()

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from appearance_opt.errors import InputError
 from appearance_opt.render.display import display
 
 BEST_PSNR = 99.0
@@ -27,7 +28,7 @@ class ViewMetrics:
 
 @dataclass(frozen=True)
 class Metrics:
-    """Means over views, and each view."""
+    """Means over views that show anything, and each view."""
 
     psnr: float
     psnr_covered: float
@@ -38,13 +39,17 @@ class Metrics:
 
 
 def compare_images(reference: NDArray, candidate: NDArray) -> Metrics:
-    """Metrics of (B, H, W, 4) images, premultiplied linear radiance and coverage. Raises ValueError for
-    shapes that differ."""
+    """Metrics of (B, H, W, 4) images, premultiplied linear radiance and coverage. Views in which both are empty (the
+    back of a single-sided plane) say nothing, and do not count. Raises ValueError for shapes that differ, InputError
+    if no view shows anything."""
     if reference.shape != candidate.shape:
         raise ValueError(f"images differ in shape: {reference.shape} and {candidate.shape}")
     views = tuple(_view(r, c) for r, c in zip(reference, candidate, strict=True))
+    seen = [v for v, r, c in zip(views, reference, candidate, strict=True) if r[..., 3].any() or c[..., 3].any()]
+    if not seen:
+        raise InputError(f"nothing is seen in any of {len(views)} views: there is nothing to compare")
     names = ("psnr", "psnr_covered", "flip", "silhouette_iou", "silhouette_shift")
-    means = {n: float(np.mean([getattr(v, n) for v in views])) for n in names}
+    means = {n: float(np.mean([getattr(v, n) for v in seen])) for n in names}
     return Metrics(**means, views=views)
 
 

@@ -11,8 +11,10 @@ import numpy as np
 
 from appearance_opt import backend
 from appearance_opt.asset import load, save
+from appearance_opt.asset.alpha import seen_through
 from appearance_opt.asset.paths import replacing
 from appearance_opt.errors import DivergedError, InputError
+from appearance_opt.jobs.parts import split
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -23,6 +25,8 @@ if TYPE_CHECKING:
     from appearance_opt.config import BakeOptions
     from appearance_opt.fit.loop import FitResult, Progress
     from appearance_opt.jobs.fitting import Stopwatch
+    from appearance_opt.jobs.parts import Parts
+    from appearance_opt.views import ViewSampler
 
 log = logging.getLogger(__name__)
 
@@ -82,7 +86,7 @@ def bake(
     heavy, light = loaded(high, options, variants), loaded_low(low, options)
     check_replaces((heavy, light), out, textures)
     watch.lap("load")
-    run = BakeJob(heavy, light, str(low) if isinstance(low, (str, Path)) else light.name, options, watch)
+    run = BakeJob(*split_pair(high, heavy, low, light), options, watch)
     result, error = run.run(progress, report is not None)
     if out is not None:
         save(result.asset, out)
@@ -95,10 +99,18 @@ def bake(
         from appearance_opt.jobs.report import write_bake_report
 
         assert report is not None
-        write_bake_report(Path(report), run.high, result, run.sampler, run.frame, options)
+        write_bake_report(Path(report), run.high, result, *run.view_of_all(), options)
 
     conclude(result, watch, None if report is None else write_report)
     return result
+
+
+def split_pair(
+    high: str | Path | Asset, heavy: Asset, low: str | Path | Asset, light: Asset
+) -> tuple[Parts, Parts, str]:
+    """(what of HIGH is baked, what of LOW is baked onto, what to call LOW). Raises InputError if it is nothing."""
+    names = [str(a) if isinstance(a, (str, Path)) else a.name for a in (high, low)]
+    return split(heavy, f"HIGH, {names[0]}", "bake"), split(light, f"LOW, {names[1]}", "bake onto"), names[1]
 
 
 def loaded_low(source: str | Path | Asset, options: BakeOptions) -> Asset:
@@ -110,19 +122,24 @@ def loaded_low(source: str | Path | Asset, options: BakeOptions) -> Asset:
 
 
 class BakeJob:
-    """Both assets in one frame; then the closed form, then the fit."""
+    """Both assets in one frame; then the closed form, then the fit. ``high``: all of HIGH, where it was aligned;
+    ``low_parts``: what of LOW is baked onto, and what is left alone."""
 
-    def __init__(self, high: Asset, low: Asset, name: str, options: BakeOptions, watch: Stopwatch) -> None:
+    def __init__(self, high_parts: Parts, low_parts: Parts, name: str, options: BakeOptions, watch: Stopwatch) -> None:
         from appearance_opt.baking import check
         from appearance_opt.baking.low import moved, prepare, unwrapped
         from appearance_opt.jobs.simplify import in_frame, support
         from appearance_opt.reference.mesh import MeshReference
         from appearance_opt.views import ViewSampler, framing
 
-        self.options, self.watch = options, watch
-        self.notes = [*high.notes, *(f"LOW: {n}" for n in low.notes)]
-        self.high = self._aligned(high, low) if options.align else high
-        check.check_place(self.high, low)
+        self.options, self.watch, self.low_parts = options, watch, low_parts
+        high, low = high_parts.fitted, low_parts.fitted
+        self.notes = [*high.notes, *high_parts.told("of HIGH are not baked")]
+        self.notes += [*(f"LOW: {n}" for n in low.notes), *low_parts.told("of LOW stay as they are")]
+        self.high = high_parts.whole
+        if options.align:
+            high, self.high = self._aligned(high_parts, low)
+        check.check_place(high, low)
         if options.unwrap:
             low = unwrapped(low, options.texture_size)
         check.check_uvs(low, name)
@@ -131,19 +148,36 @@ class BakeJob:
         if not options.unwrap:
             check.check_overlap(self.low.mesh, name)
         watch.lap("check")
-        self.frame = framing(np.concatenate([self.high.points(), low.points()]))
-        self.reference = MeshReference(in_frame(self.high, *self.frame))
+        self.frame = framing(np.concatenate([high.points(), low.points()]))
+        self.reference = MeshReference(in_frame(high, *self.frame))
         self.mesh = moved(self.low.mesh, np.array(self.frame[0]) - low.origin, self.frame[1])
         hull = support(self.reference.merged.positions)
         self.sampler = ViewSampler((0.0, 0.0, 0.0), 1.0, options.seed, hull=hull, light=options.light)
         watch.lap("reference")
 
-    def _aligned(self, high: Asset, low: Asset) -> Asset:
+    def _aligned(self, high_parts: Parts, low: Asset) -> tuple[Asset, Asset]:
+        """(what of HIGH is baked, all of it), aligned to what it is baked onto."""
         from appearance_opt.baking.align import align
 
-        placed, scale, shift = align(high, low)
+        placed, scale, shift = align(high_parts.fitted, low)
         self.notes.append(f"HIGH was scaled by {scale:.6g} and moved by {', '.join(f'{x:.6g}' for x in shift)} m")
-        return placed
+        from_world = shift + scale * np.array(high_parts.fitted.origin) - low.origin
+        kept = tuple(
+            replace(m, positions=(m.positions.astype(np.float64) * scale + from_world).astype(np.float32))
+            for m in high_parts.kept
+        )
+        return placed, replace(high_parts, fitted=placed, kept=kept).whole
+
+    def view_of_all(self) -> tuple[ViewSampler, tuple[tuple[float, float, float], float]]:
+        """(sampler, frame) of views for a report, which shows transparent parts, too."""
+        from appearance_opt.jobs.simplify import framed
+
+        low = self.low_parts.whole
+        if not any(map(seen_through, (*self.high.meshes, *low.meshes))):
+            return self.sampler, self.frame
+        points = np.concatenate([self.high.points(), low.points()])
+        frame, sampler = framed(points, self.options.seed, self.options.light)
+        return sampler, frame
 
     def run(self, progress: Progress | None, with_report: bool) -> tuple[BakeResult, DivergedError | None]:
         """The closed form, and the fit that starts from it."""
@@ -239,7 +273,7 @@ class BakeJob:
         asset = with_material(self.low.asset, material_change(self._in_metres(maps), self.options))
         if self.options.wants("base-color"):  # the map holds the whole colour: vertex colours would tint it again
             asset = replace(asset, meshes=tuple(replace(m, colors=None) for m in asset.meshes))
-        return replace(asset, notes=())
+        return self.low_parts.with_kept(replace(asset, notes=()))
 
 
 _FITTED = ("red", "green", "blue", "roughness", "metalness", "normal_x", "normal_y", "normal_z")

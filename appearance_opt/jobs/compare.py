@@ -49,7 +49,8 @@ def compare(
 ) -> Comparison:
     """Render both assets from ``views`` random cameras under random lights and measure the difference.
     ``out``: folder for a report with pictures. ``refine``, ``missing_textures``, ``root``: see ``load``; ``variants``:
-    of the reference. Raises AppearanceError."""
+    of the reference. What is transparent is drawn so (see ``render.layers``). Raises AppearanceError, also if one of
+    the two shows nothing."""
     from appearance_opt.asset import load
     from appearance_opt.asset.types import Asset
 
@@ -64,13 +65,11 @@ def compare(
         for a, chosen in ((reference, variants), (candidate, None))
     )
     backend.select(device)
-    from appearance_opt.jobs.simplify import in_frame, support
-    from appearance_opt.views import MEASURED, ViewSampler, framing
+    from appearance_opt.jobs.simplify import framed, in_frame
+    from appearance_opt.views import MEASURED
 
-    points = np.concatenate([first.points(), second.points()])
-    frame = framing(points)
-    hull = support(((points - np.array(frame[0])) / frame[1]).astype(np.float32))
-    sampler = ViewSampler((0.0, 0.0, 0.0), 1.0, seed, stream=MEASURED, hull=hull)
+    frame, sampler = framed(np.concatenate([first.points(), second.points()]), seed)
+    sampler = sampler.held_out(MEASURED)
     result = compare_in_frame(in_frame(first, *frame), in_frame(second, *frame), sampler, views, resolution, samples)
     if out is not None:
         from appearance_opt.jobs.report import write_compare_report
@@ -87,6 +86,12 @@ def compare_in_frame(
 
     drawn = sampler.draw(0, views)
     first, second = (render_asset(a, drawn, resolution, samples) for a in (reference, candidate))
+    for name, image, side in ((reference.name, first, "reference"), (candidate.name, second, "candidate")):
+        if not image[..., 3].any():
+            raise InputError(
+                f"{name}: nothing of it is seen in any of the {views} views, so that there is nothing to compare; "
+                f"is the {side} far smaller than the other, inside out, or altogether transparent?"
+            )
     return Comparison(compare_images(first, second), first, second)
 
 

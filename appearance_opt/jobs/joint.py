@@ -34,7 +34,7 @@ def joint(
     """Fit base shape, displacement, normals and material of ``low`` to ``high`` and write the result to ``out``
     (None: do not write). LOW keeps its topology and its texture coordinates; each kind of detail goes where it
     is represented best. Raises AppearanceError."""
-    from appearance_opt.jobs.bake import BakeJob, loaded_low
+    from appearance_opt.jobs.bake import BakeJob, loaded_low, split_pair
     from appearance_opt.jobs.displaced import require_memory, write_companion, write_levels
     from appearance_opt.jobs.fitting import Stopwatch, conclude
 
@@ -43,10 +43,11 @@ def joint(
         check_paths(source, out, report)
     heavy, light = loaded(high, options, variants), loaded_low(low, options)
     check_replaces((heavy, light), out)
-    require_memory(light.triangle_count, options)
+    parts = split_pair(high, heavy, low, light)
+    require_memory(parts[1].fitted.triangle_count, options)
     watch.lap("load")
-    job = BakeJob(heavy, light, str(low) if isinstance(low, (str, Path)) else light.name, options, watch)
-    result = _fitted(job, light, options, progress, report is not None)
+    job = BakeJob(*parts, options, watch)
+    result = _fitted(job, options, progress, report is not None)
     if out is not None:
         save(result.asset, out)
         write_companion(result.asset, Path(out))
@@ -60,15 +61,13 @@ def joint(
         from appearance_opt.jobs.report import write_simplify_report
 
         assert report is not None
-        write_simplify_report(Path(report), job.high, result, job.sampler, job.frame, options)
+        write_simplify_report(Path(report), job.high, result, *job.view_of_all(), options)
 
     conclude(result, watch, None if report is None else write_report)
     return result
 
 
-def _fitted(
-    job: BakeJob, light: Asset, options: BakeOptions, progress: Progress | None, with_report: bool
-) -> SimplifyResult:
+def _fitted(job: BakeJob, options: BakeOptions, progress: Progress | None, with_report: bool) -> SimplifyResult:
     from appearance_opt.baking.closed_form import Settings, bake
     from appearance_opt.baking.low import movable
     from appearance_opt.fit.model import Model, Rates
@@ -77,6 +76,7 @@ def _fitted(
     from appearance_opt.jobs.fitting import clean_maps, fit_start
     from appearance_opt.jobs.start import Start
 
+    light, with_kept = job.low_parts.fitted, job.low_parts.with_kept
     mesh = movable(job.mesh)
     drawn, displacement = displaced(job.reference, mesh, options, job.cage)
     found = bake(job.reference, drawn, Settings(options.texture_size, samples=options.samples))
@@ -102,14 +102,15 @@ def _fitted(
     if options.wants("emission"):
         final |= transfer_emission(job.reference, model.posed_mesh(), options.texture_size)
     result = SimplifyResult(
-        exporter.base(model, final),
-        exporter.drawn(initial, start.maps)[initial.level],
+        with_kept(exporter.base(model, final)),
+        with_kept(exporter.drawn(initial, start.maps)[initial.level]),
         fitted,
         len(mesh.faces),
-        job.high.triangle_count,
+        len(job.reference.merged.faces),
         notes=[*job.notes, *fitted.notes()],
         error=error,
-        tessellated=exporter.drawn(model, final),
+        tessellated={k: with_kept(a) for k, a in exporter.drawn(model, final).items()},
+        kept_triangles=job.low_parts.kept_triangles,
     )
     job.watch.lap("export")
     return result

@@ -17,6 +17,7 @@ from appearance_opt.asset.origin import ZERO
 from appearance_opt.asset.types import Texture
 from appearance_opt.config import CommonOptions, SimplifyOptions, as_dict, with_values
 from appearance_opt.errors import DivergedError, InputError
+from appearance_opt.jobs.parts import split
 from appearance_opt.jobs.paths import check_paths, check_replaces
 
 if TYPE_CHECKING:
@@ -29,7 +30,9 @@ if TYPE_CHECKING:
     from appearance_opt.fit.loop import FitResult, Progress
     from appearance_opt.jobs.fitting import Stopwatch
     from appearance_opt.jobs.growth import Effort
+    from appearance_opt.jobs.parts import Parts
     from appearance_opt.jobs.start import Start
+    from appearance_opt.views import ViewSampler
 
 log = logging.getLogger(__name__)
 
@@ -38,10 +41,11 @@ CHECKPOINT_SECONDS = 10.0
 
 @dataclass
 class SimplifyResult:
-    """What ``simplify`` did. ``asset``: the result; ``start``: the same before the fit; ``tessellated``: with a
-    displacement map, the mesh as drawn at each level (and ``start`` at the finest one); ``fit``: curve and
-    counts; ``seconds``: wall-clock time by stage; ``notes``: what the user should know; ``error``: set when the fit
-    diverged (``simplify`` raises it after writing the best state)."""
+    """What ``simplify`` did. ``asset``: the result, whose first mesh was fitted; the others passed through, their
+    triangles are ``kept_triangles``, and ``triangles`` and ``source_triangles`` do not count them. ``start``: the same
+    before the fit; ``tessellated``: with a displacement map, the mesh as drawn at each level (and ``start`` at the
+    finest one); ``fit``: curve and counts; ``seconds``: wall-clock time by stage; ``notes``: what the user should know;
+    ``error``: set when the fit diverged (``simplify`` raises it after writing the best state)."""
 
     asset: Asset
     start: Asset
@@ -52,6 +56,7 @@ class SimplifyResult:
     notes: list[str] = field(default_factory=list)
     error: DivergedError | None = None
     tessellated: dict[int, Asset] = field(default_factory=dict)
+    kept_triangles: int = 0
 
     @property
     def shown(self) -> Asset:
@@ -75,7 +80,8 @@ def simplify(
 
     ``report``: folder for pictures, metrics and report.html. ``checkpoint``: folder in which the state is kept
     every few seconds; with ``resume`` a run goes on from there. ``variants``: USD variant selections. ``began``:
-    ``time.perf_counter()`` at which the time budget began, if before this call. Ctrl-C ends the fit early and still
+    ``time.perf_counter()`` at which the time budget began, if before this call. Transparent meshes of the source pass
+    into the result as they are (see ``jobs.parts``). Ctrl-C ends the fit early and still
     writes the best state so far; once the result is written it ends the report. Raises AppearanceError.
     """
     from appearance_opt.jobs.displaced import write_companion, write_levels
@@ -87,9 +93,10 @@ def simplify(
         check_paths(options.init, out)
     asset = loaded(source, options, variants)
     check_replaces([asset], out)
+    parts = split(asset, str(source) if isinstance(source, (str, Path)) else asset.name, "simplify")
     watch.lap("load")
     backend.select(options.device)
-    run = _Job(asset, options, watch, progress, _checkpointer(asset, options, checkpoint, resume), report is not None)
+    run = _Job(parts, options, watch, progress, _checkpointer(asset, options, checkpoint, resume), report is not None)
     result = run.fit()
     if out is not None:
         save(result.asset, out)
@@ -100,7 +107,9 @@ def simplify(
         watch.lap("write")
     if result.error is not None:
         raise result.error
-    sampler, frame = run.sampler, run.frame
+    frame, sampler = run.frame, run.sampler
+    if parts.kept:  # they may lie outside of the frame of the fit
+        frame, sampler = framed(parts.whole.points(), options.seed, options.light)
     del run
 
     def write_report() -> None:
@@ -109,7 +118,7 @@ def simplify(
         # the report uploads what it draws: a heavy reference need not be held twice
         backend.release_memory()
         assert report is not None
-        write_simplify_report(Path(report), asset, result, sampler, frame, options)
+        write_simplify_report(Path(report), parts.whole, result, sampler, frame, options)
 
     conclude(result, watch, None if report is None else write_report)
     return result
@@ -128,7 +137,7 @@ class _Job:
 
     def __init__(
         self,
-        asset: Asset,
+        parts: Parts,
         options: SimplifyOptions,
         watch: Stopwatch,
         progress: Progress | None,
@@ -143,6 +152,11 @@ class _Job:
 
         self.options, self.watch = options, watch
         self.progress, self.checkpointer, self.with_report = progress, checkpointer, with_report
+        self.parts, asset = parts, parts.fitted
+        self.notes = [
+            *asset.notes,
+            *parts.told("pass into the result as they are, and count for no --triangles or --ratio"),
+        ]
         self.frame = framing(asset.points())
         # the fit works on an object of radius 1 around the origin, so that no threshold in it and no
         # digit of a float depends on the scale and place of the input
@@ -159,14 +173,14 @@ class _Job:
             left = seconds_left(options, watch, with_report)
             self.start = self._kept(lambda: make_start(self.reference, options, self.sampler, triangles, left))
         else:
-            mesh = loaded_mesh(Path(options.init), self.frame, asset.triangle_count, options)
+            mesh, notes = loaded_mesh(Path(options.init), self.frame, asset.triangle_count, options)
+            self.notes += notes
             if options.relative is False and "shape" in options.fit and not options.displaced:
                 self.start = self._shaped(lambda effort: mended(self.reference, self.sampler, options, mesh, effort))
                 # the shape has been let go of; the mended one is a likeness
                 self.options = with_values(self.options, relative=None)
             else:
                 self.start = self._kept(lambda: transferred(self.reference, mesh, options))
-        self.asset = asset
         watch.lap("start")
 
     def _kept(self, make: Callable[[], Start]) -> Start:
@@ -222,9 +236,10 @@ class _Job:
             checkpointer=self.checkpointer,
             with_report=self.with_report,
         )
-        name = f"{self.asset.name}_{len(self.start.mesh.faces)}"
-        double_sided = any(m.material.double_sided for m in self.asset.meshes)
-        exporter = Exporter(*self.frame, self.asset.origin, name, double_sided)
+        asset = self.parts.fitted
+        name = f"{asset.name}_{len(self.start.mesh.faces)}"
+        double_sided = any(m.material.double_sided for m in asset.meshes)
+        exporter = Exporter(*self.frame, asset.origin, name, double_sided)
         initial = Model(self.start.mesh, self.start.maps, frozenset(), Rates(), self.start.levels[-1:])
         begin = exporter.drawn(initial, self.start.maps)[initial.level]
         maps = clean_maps(model, self.start.known)
@@ -233,14 +248,15 @@ class _Job:
         tessellated = exporter.drawn(model, maps) if o.displaced else {}
         self.watch.lap("export")
         return SimplifyResult(
-            result,
-            begin,
+            self.parts.with_kept(result),
+            self.parts.with_kept(begin),
             fitted,
             len(self.start.mesh.faces),
-            self.asset.triangle_count,
-            notes=[*self.asset.notes, *fitted.notes()],
+            asset.triangle_count,
+            notes=[*self.notes, *fitted.notes()],
             error=error,
-            tessellated=tessellated,
+            tessellated={k: self.parts.with_kept(a) for k, a in tessellated.items()},
+            kept_triangles=self.parts.kept_triangles,
         )
 
 
@@ -253,6 +269,18 @@ def in_frame(asset: Asset, centre: tuple[float, float, float], scale: float) -> 
         for m in asset.meshes
     ]
     return replace(asset, meshes=tuple(moved), origin=ZERO)
+
+
+def framed(
+    points: NDArray, seed: int, light: str = "point"
+) -> tuple[tuple[tuple[float, float, float], float], ViewSampler]:
+    """(centre and radius of points (N, 3) in the world, sampler of views that are framed to them, in
+    units of that radius and around the origin)."""
+    from appearance_opt.views import ViewSampler, framing
+
+    frame = framing(points)
+    hull = support(((points - np.array(frame[0])) / frame[1]).astype(np.float32))
+    return frame, ViewSampler((0.0, 0.0, 0.0), 1.0, seed, hull=hull, light=light)
 
 
 def support(positions: NDArray, count: int = 256) -> NDArray[np.float64]:

@@ -20,6 +20,7 @@ from appearance_opt.initial.sphere import random_maps, sphere
 from appearance_opt.initial.transfer import transfer
 from appearance_opt.initial.visibility import importance, pixel_counts
 from appearance_opt.jobs.displaced import REACH, displaced, flat_map, gutter, median_edge, require_memory
+from appearance_opt.jobs.parts import split
 from appearance_opt.latent.displacement import DISPLACEMENT
 from appearance_opt.latent.latent import LatentMesh
 from appearance_opt.views import START, VISIBILITY
@@ -202,14 +203,17 @@ def transferred(reference: MeshReference, mesh: LatentMesh, options: SimplifyOpt
 
 def loaded_mesh(
     path: Path, frame: tuple[tuple[float, float, float], float], available: int, options: SimplifyOptions
-) -> LatentMesh:
-    """The mesh of a file, moved to a ``frame`` (centre, scale), with a new atlas. ``available``: triangles of the
-    reference. Raises InputError when it has more triangles than were asked for."""
+) -> tuple[LatentMesh, list[str]]:
+    """(the mesh of a file, moved to a ``frame`` (centre, scale), with a new atlas; notes). ``available``: triangles of
+    the reference. Transparent parts are left out, for those of the input pass into the result. Raises InputError when
+    it has more triangles than were asked for."""
     from appearance_opt.asset import load
     from appearance_opt.asset.normals import weld
 
     # its own maps are not used: it may lack them
-    asset = load(path, refine=options.refine, missing_textures="ignore", root=options.root, keep_layout=True)
+    given = load(path, refine=options.refine, missing_textures="ignore", root=options.root, keep_layout=True)
+    parts = split(given, f"--init {path}", "start from")
+    asset = parts.fitted
     most = None if options.triangles is None and options.ratio is None else budget(options, available)
     if most is not None and asset.triangle_count > most:
         raise InputError(f"--init {path}: has {asset.triangle_count} triangles, more than the {most} asked for")
@@ -221,4 +225,5 @@ def loaded_mesh(
     faces = place[f].astype(np.int32)
     require_memory(len(faces), options)
     offset = np.array(asset.origin) - np.array(centre)
-    return unwrap((p[first] + offset) / scale, faces, options.texture_size, gutter(len(faces), options))
+    mesh = unwrap((p[first] + offset) / scale, faces, options.texture_size, gutter(len(faces), options))
+    return mesh, parts.told("of --init are left out: those of the input pass into the result")

@@ -9,12 +9,13 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from appearance_opt.asset.alpha import seen_through
 from appearance_opt.asset.normals import split_where_cancelled, summed_normals
 from appearance_opt.asset.packing import EMISSION
 from appearance_opt.asset.sides import culled, single_sided
 from appearance_opt.asset.tangents import any_tangent, split_and_tangents
-from appearance_opt.reference.textures import emission_maps, material_maps
-from appearance_opt.render import deferred, upload
+from appearance_opt.reference.textures import coverage_maps, emission_maps, material_maps
+from appearance_opt.render import deferred, layers, upload
 from appearance_opt.render.deferred import Grid
 from appearance_opt.render.freezing import Frozen
 from appearance_opt.render.material import evaluate, shading_normal
@@ -34,7 +35,8 @@ MAX_PIXELS = 1 << 20
 
 @dataclass(frozen=True)
 class MergedMesh:
-    """All meshes of an asset as one, vertices split where attributes differ. See ``asset.types.Mesh``.
+    """All meshes of an asset as one, vertices split where attributes differ. See ``asset.types.Mesh``; ``colors``
+    (V, 4) have alpha.
     ``material``: (F,) index into the asset's materials, in the order of its meshes."""
 
     positions: NDArray[np.float32]
@@ -51,7 +53,7 @@ class MeshReference:
 
     ``merged``: the host arrays; ``single`` (F,): faces that are seen from their front only; ``scene``: for tracing
     rays; ``surface``, ``maps``: device data; ``emission``: what the materials emit, which is not rendered; None if
-    they do not.
+    they do not; ``coverage``: what light the materials keep back; None if all of it.
     """
 
     def __init__(self, asset: Asset) -> None:
@@ -59,10 +61,14 @@ class MeshReference:
         by_id = {id(m.material): m.material for m in asset.meshes}
         self.maps = material_maps([by_id[k] for k in materials])
         self.emission = emission_maps([by_id[k] for k in materials])
+        self.coverage = coverage_maps([by_id[k] for k in materials])
         self.merged = merge(asset, [materials.index(id(m.material)) for m in asset.meshes], self.maps.has_normal_map)
         m = self.merged
         self.single = single_sided(asset.meshes)
-        hidden_backs = culled(m.positions, m.faces, self.single)
+        passing = None
+        if self.coverage is not None:
+            passing = np.repeat([seen_through(m) for m in asset.meshes], [len(m.faces) for m in asset.meshes])
+        hidden_backs = culled(m.positions, m.faces, self.single, passing)
         self.scene = upload.scene_of(m.positions, m.faces, hidden_backs)
         if m.tangents is None:
             frames = upload.packets(2, m.uvs)
@@ -72,13 +78,18 @@ class MeshReference:
         self.surface = Surface(
             faces=upload.index_packets(m.faces, m.material),
             vertices=upload.packets(8, m.positions, padding, m.normals),
-            frames=frames if self.maps.layers or (self.emission is not None and self.emission.layers) else None,
+            frames=frames if self._needs_uvs() else None,
             colors=None if m.colors is None else upload.packets(4, m.colors),
             has_tangents=m.tangents is not None,
             culled=None if hidden_backs is None else mi.Bool(hidden_backs),
         )
-        self._run = Frozen(self.surface, self.maps)
+        self._run = Frozen(self.surface, self.maps, self.coverage)
         self._grid: Grid | None = None
+
+    def _needs_uvs(self) -> bool:
+        """Does any material look up a texture?"""
+        emits = self.emission is not None and bool(self.emission.layers)
+        return bool(self.maps.layers) or emits or self.coverage is not None
 
     def render(self, views: Views, resolution: int, samples: int = 16) -> NDArray[np.float32]:
         """See ``Reference.render``."""
@@ -93,9 +104,12 @@ class MeshReference:
         pairs = []
         with dr.suspend_grad():
             for part, grid in self._parts(views, resolution):
-                both = deferred.render_pair(
-                    self.scene, self.surface, self.maps, part.records(), grid, samples, width, self._run
-                )
+                records, drawn = part.records(), (self.scene, self.surface, self.maps)
+                if self.coverage is not None:  # outlines of what is seen through may lie anywhere
+                    settings = (samples, None), (1, width)
+                    both = [self.render_device(records, grid, n, w) for n, w in settings]
+                else:
+                    both = [*deferred.render_pair(*drawn, records, grid, samples, width, self._run)]
                 pairs.append([_host(image, grid) for image in both])
         average, points = (np.concatenate(images) for images in zip(*pairs, strict=True))
         return average, points
@@ -117,7 +131,10 @@ class MeshReference:
         """The same for a batch whose records are on the device; the image stays there, flat. ``width``: as for
         ``deferred.render_image``."""
         with dr.suspend_grad():
-            return deferred.render_image(self.scene, self.surface, self.maps, records, grid, samples, width, self._run)
+            drawn = self.scene, self.surface, self.maps
+            if self.coverage is not None:
+                return layers.render_image(*drawn, self.coverage, records, grid, samples, width, self._run)
+            return deferred.render_image(*drawn, records, grid, samples, width, self._run)
 
     def sample(self, triangle: mi.UInt32, b1: mi.Float, b2: mi.Float, area: mi.Float) -> SurfaceSample:
         """Appearance at barycentric points of triangles, averaged over a patch of ``area`` (world units
@@ -187,8 +204,11 @@ def _complete(mesh: Mesh, need_tangents: bool, need_colors: bool) -> MergedMesh:
     positions, faces = mesh.positions, mesh.faces
     normals = mesh.normals
     uvs = np.zeros((len(positions), 2), np.float32) if mesh.uvs is None else mesh.uvs
-    # drawn opaque: alpha of some meshes and not of others makes no difference
-    colors = np.ones((len(positions), 3), np.float32) if mesh.colors is None else mesh.colors[:, :3]
+    colors = np.ones((len(positions), 4), np.float32)
+    if mesh.colors is not None:
+        # the alpha of opaque modes means nothing
+        width = 3 if mesh.material.alpha_mode == "opaque" else mesh.colors.shape[1]
+        colors[:, :width] = mesh.colors[:, :width]
     tangents = mesh.tangents
     if normals is None:
         index, faces, normals = split_where_cancelled(positions, faces, summed_normals(positions, faces))

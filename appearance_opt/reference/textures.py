@@ -6,7 +6,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from appearance_opt.asset.alpha import coverage, kind_of
 from appearance_opt.asset.packing import EMISSION, resized
+from appearance_opt.render.layers import CHANNELS, Coverage
 from appearance_opt.render.material import MaterialMaps, TexelLayer
 from appearance_opt.render.texture import CLAMP, MIRROR, REPEAT, build_pyramid
 
@@ -52,6 +54,22 @@ def emission_maps(materials: list[Material]) -> MaterialMaps | None:
         bases.append(base)
         wraps.append(REPEAT if texture is None else _WRAP[texture.wrap[0]])
     return MaterialMaps((TexelLayer(EMISSION, build_pyramid(bases, wraps).halved()),))
+
+
+def coverage_maps(materials: list[Material]) -> Coverage | None:
+    """What light the materials keep back; None if that is all of it."""
+    if all(kind_of(m) == "opaque" for m in materials):
+        return None
+    bases, wraps = [], []
+    for m in materials:
+        factor, texture = coverage(m)
+        texels = np.ones((1, 1, 1), np.float32) if texture is None else texture.linear()
+        base = np.empty((*texels.shape[:2], 2), np.float32)
+        base[..., 0] = texels[..., 0] * np.float32(factor)
+        base[..., 1] = m.alpha_cutoff if kind_of(m) == "mask" else -1
+        bases.append(base)
+        wraps.append(REPEAT if texture is None else _WRAP[texture.wrap[0]])
+    return Coverage(TexelLayer(CHANNELS, build_pyramid(bases, wraps).halved()))
 
 
 def _textures(m: Material) -> list[Texture]:

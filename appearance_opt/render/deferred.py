@@ -111,8 +111,7 @@ def render_image(
     so that memory does not grow with ``samples``.
     """
     drawing = Drawing(surface, maps, records, grid.size, grid.rows)
-    if width is None:
-        width = 1.0 if samples == 1 else 0.0
+    width = filter_width(samples) if width is None else width
     image = dr.zeros(mi.Float, grid.pixels * 4)
     for dx, dy in rays.sub_pixel_offsets(samples):
         hits, _, covered = _seen(scene, drawing, grid, dx, dy, run)
@@ -120,6 +119,11 @@ def render_image(
         mode = dr.ReduceMode.NoConflicts
         image = _with_shaded(image, drawing, hits, covered, 1 / samples, width, mode, run)
     return image
+
+
+def filter_width(samples: int) -> float:
+    """Width in pixels over which textures are filtered where nothing else is asked for; see ``render_image``."""
+    return 1.0 if samples == 1 else 0.0
 
 
 def render_pair(

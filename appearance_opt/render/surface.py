@@ -32,7 +32,7 @@ class Surface:
     normal, 0. ``corners`` (4 F): three indices into ``frames`` and 0, or None where they equal the
     vertex indices. ``frames`` (8 R): u, v, handedness, 0, tangent, 0; or (2 R): u, v without a normal
     map (``has_tangents`` is False then); or None without texture coordinates. ``colors`` (4 V): linear
-    vertex colour, 0, or None. ``vertices`` and ``frames`` may carry gradients. ``culled`` (F,): faces that are not
+    vertex colour, alpha, or None. ``vertices`` and ``frames`` may carry gradients. ``culled`` (F,): faces that are not
     to be seen from behind (see ``asset.sides.culled``), or None without any.
     """
 
@@ -49,7 +49,8 @@ class Surface:
 class Hit:
     """What the shader needs at each sample. Directions are unit vectors in world space.
 
-    ``footprint``: area of the sample in UV space, detached. ``handedness``: sign of the bitangent.
+    ``footprint``: area of the sample in UV space, detached. ``handedness``: sign of the bitangent. ``color``,
+    ``alpha``: of the vertices.
     """
 
     position: mi.Point3f
@@ -61,6 +62,7 @@ class Hit:
     tangent: mi.Vector3f | None = None
     handedness: mi.Float | None = None
     color: mi.Color3f | None = None
+    alpha: mi.Float | None = None
 
 
 def interpolate(surface: Surface, camera: Camera, samples: Samples, resolution: mi.Float, width: mi.Float) -> Hit:
@@ -157,6 +159,7 @@ def _attributes(
     if surface.colors is not None:
         c = [_packet(surface.colors, face[k], 4) for k in range(3)]
         hit.color = mi.Color3f(*(mix([v[k] for v in c]) for k in range(3)))
+        hit.alpha = mix([v[3] for v in c])
     if surface.frames is None:
         return
     corner = face

@@ -1,0 +1,56 @@
+"""Which parts of an asset a job works on, and which pass into its result as they are."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+from appearance_opt.asset.alpha import listed, seen_through, settled
+from appearance_opt.errors import InputError
+
+if TYPE_CHECKING:
+    from appearance_opt.asset.types import Asset, Mesh
+
+
+@dataclass(frozen=True)
+class Parts:
+    """``fitted``: what a job works on, with the notes and files of the whole; ``kept``: meshes that it leaves alone:
+    they hide nothing of the others, cast no occlusion on them, and go to the result with all that they have."""
+
+    fitted: Asset
+    kept: tuple[Mesh, ...] = ()
+
+    @property
+    def kept_triangles(self) -> int:
+        """Triangles that are left alone."""
+        return sum(len(m.faces) for m in self.kept)
+
+    @property
+    def whole(self) -> Asset:
+        """All of the asset, the kept meshes last."""
+        return self.with_kept(self.fitted)
+
+    def with_kept(self, result: Asset) -> Asset:
+        """What became of ``fitted``, with the kept meshes after it."""
+        return replace(result, meshes=(*result.meshes, *self.kept)) if self.kept else result
+
+    def told(self, becomes: str) -> list[str]:
+        """A note that names the kept meshes, or none without any. ``becomes``: what the job does with them."""
+        if not self.kept:
+            return []
+        names = listed(m.name for m in self.kept)
+        return [f"transparent parts {becomes}: {len(self.kept)} ({names}) of {self.kept_triangles} triangles"]
+
+
+def split(asset: Asset, name: str, job: str) -> Parts:
+    """Opaque meshes are fitted, transparent ones kept. Raises InputError if nothing is left to fit. ``name`` of the
+    asset, and what the ``job`` does to it, for the message."""
+    asset = settled(asset)
+    kept = tuple(m for m in asset.meshes if seen_through(m))
+    fitted = tuple(m for m in asset.meshes if not seen_through(m))
+    if not fitted:
+        raise InputError(
+            f"{name}: all of it is transparent ({listed(m.material.name for m in kept)}), and transparent parts are "
+            f"kept as they are: there is nothing to {job}"
+        )
+    return Parts(replace(asset, meshes=fitted) if kept else asset, kept)
