@@ -33,7 +33,7 @@ def load(
     with the material's constants (without a normal map, if it is
     that) and a note. ``root``: folder in which files that it refers to may lie, beside its own. ``keep_layout``:
     for a mesh to be baked onto, whose vertices and texture coordinates stay as the file has them: no transform of a
-    texture is applied to them, and a glTF mesh without normals is not taken apart into flat triangles. Harmless
+    texture is applied to them, and vertices of a mesh without normals are not split at hard edges. Harmless
     faults are repaired and noted in ``Asset.notes``, unless ``mend`` is off. Raises InputError for everything else,
     naming the file.
     """
@@ -73,10 +73,14 @@ def _read(
         from appearance_opt.asset.obj import load_obj
 
         return load_obj(path, companions, keep_layout)
-    if suffix in (".ply", ".stl"):
+    if suffix == ".ply":
         from appearance_opt.asset.geometry import load_geometry
 
-        return load_geometry(path)
+        return load_geometry(path, keep_layout)
+    if suffix == ".stl":
+        from appearance_opt.asset.stl import load_stl
+
+        return load_stl(path, keep_layout)
     from appearance_opt.asset.usd_read import load_usd
 
     return load_usd(path, refine, variants, companions, keep_layout)

@@ -102,3 +102,8 @@ class Batch:
             out.append(replace(mesh, **changed))
             start, first_face = end, last_face
         return out
+
+
+def in_range(mesh: Mesh) -> bool:
+    """Do all its corners exist? (If not, ``repair`` refuses it, and counts them.)"""
+    return not len(mesh.faces) or (mesh.faces.min() >= 0 and mesh.faces.max() < len(mesh.positions))

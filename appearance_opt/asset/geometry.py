@@ -1,35 +1,39 @@
-"""PLY and STL: geometry alone, through trimesh."""
+"""PLY: geometry alone, through trimesh."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from appearance_opt.asset.normals import weld
+from appearance_opt.asset.creases import shaded
+from appearance_opt.asset.normals import unit
 from appearance_opt.asset.origin import settle
 from appearance_opt.asset.paths import read_bytes
 from appearance_opt.asset.types import Asset, Material, Mesh, srgb_to_linear
 from appearance_opt.errors import InputError
 
+if TYPE_CHECKING:
+    import trimesh
+    from numpy.typing import NDArray
 
-def load_geometry(path: Path) -> Asset:
-    """Read a .ply or .stl file (vertices at the same place welded, for STL has no shared ones). Raises
-    InputError."""
+
+def load_geometry(path: Path, keep_layout: bool = False) -> Asset:
+    """Read a .ply file. Without normals, edges sharp by ``creases.smooth_by_angle`` are hard.
+    ``keep_layout``: see ``asset.load``. Raises InputError."""
     import io
 
     import trimesh
 
     path = Path(path)
     data = read_bytes(path)
-    kind = path.suffix.lower().lstrip(".")
     notes = ["no material in this format: a default one is used"]
-    if kind == "ply":
-        data = _plain_ply(data, path, notes)
+    data = _plain_ply(data, path, notes)
     try:
-        loaded = trimesh.load(io.BytesIO(data), file_type=kind, process=False, force="mesh")
+        loaded = trimesh.load(io.BytesIO(data), file_type="ply", process=False, force="mesh")
     except Exception as error:  # trimesh's readers raise anything on damaged files
-        raise InputError(f"{path}: not a readable {kind.upper()} file ({type(error).__name__})") from error
+        raise InputError(f"{path}: not a readable PLY file ({type(error).__name__})") from error
     if not isinstance(loaded, trimesh.Trimesh) or not len(loaded.faces):
         raise InputError(f"{path}: there are no triangles in it")
     positions = np.asarray(loaded.vertices, np.float64)
@@ -37,13 +41,25 @@ def load_geometry(path: Path) -> Asset:
     colors = None
     if loaded.visual.kind == "vertex":
         colors = srgb_to_linear(np.asarray(loaded.visual.vertex_colors[:, :3], np.float32) / np.float32(255))
-    if kind == "stl":
-        first, place = weld(positions)
-        positions, faces, colors = positions[first], place[faces].astype(np.int32), None
+    normals = _normals(loaded)
     material = Material(name=path.stem, roughness=0.8)
-    mesh = Mesh(positions, faces, colors=colors, material=material, name=path.stem)  # type: ignore[arg-type]
+    mesh = Mesh(positions, faces, normals, colors=colors, material=material, name=path.stem)  # type: ignore[arg-type]
     meshes, origin = settle([mesh], notes.append)
+    if not keep_layout:
+        meshes = shaded(meshes)
     return Asset(tuple(meshes), path.stem, tuple(notes), origin=origin)
+
+
+def _normals(loaded: trimesh.Trimesh) -> NDArray[np.float32] | None:
+    """(V, 3) normals of the vertices of a file, None if it has none: trimesh hands out others then."""
+    vertex = loaded.metadata.get("_ply_raw", {}).get("vertex", {}).get("data")
+    try:
+        given = np.stack([np.asarray(vertex[name], np.float64).ravel() for name in ("nx", "ny", "nz")], axis=1)
+    except (KeyError, ValueError, TypeError, IndexError):
+        return None
+    if len(given) != len(loaded.vertices) or not given.any():
+        return None
+    return unit(given).astype(np.float32)
 
 
 def _plain_ply(data: bytes, path: Path, notes: list[str]) -> bytes:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from appearance_opt.asset import uv_frames
-from appearance_opt.asset.batch import Batch
+from appearance_opt.asset.batch import Batch, in_range
 from appearance_opt.asset.gltf_accessors import Document
 from appearance_opt.asset.gltf_draco import DRACO, Compressed
 from appearance_opt.asset.gltf_materials import READ_EXTENSIONS, MaterialReader
@@ -155,7 +155,7 @@ class _Reader:
 
     def _flat_where_needed(self, meshes: list[Mesh]) -> list[Mesh]:
         """The meshes with flat normals where they have none, all in one go."""
-        lacking = [k for k, m in enumerate(meshes) if m.normals is None and _in_range(m)]
+        lacking = [k for k, m in enumerate(meshes) if m.normals is None and in_range(m)]
         if not lacking:
             return meshes
         self.note("meshes without normals are shaded flat, as glTF 2.0 asks")
@@ -213,11 +213,6 @@ class _Source:
                 )
             out[:, : moved.shape[1]] += float(weight) * moved
         return out
-
-
-def _in_range(mesh: Mesh) -> bool:
-    """Do all its corners exist? (If not, ``repair`` refuses it, and counts them.)"""
-    return not len(mesh.faces) or (mesh.faces.min() >= 0 and mesh.faces.max() < len(mesh.positions))
 
 
 def flat_normals(positions: NDArray, faces: NDArray) -> tuple[NDArray[np.intp], NDArray[np.int64], NDArray[np.float32]]:

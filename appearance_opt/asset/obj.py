@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from appearance_opt.asset.creases import shaded
 from appearance_opt.asset.mtl import MaterialReader
 from appearance_opt.asset.origin import settle
 from appearance_opt.asset.paths import read_text
@@ -46,6 +47,10 @@ class _Parser:
         self.normals: list[list[float]] = []
         # by material, and by what the corners have: texture coordinates, normals
         self.polygons: dict[tuple[str, bool, bool], list[list[tuple[int, int, int]]]] = {}
+        # the smoothing groups of the same polygons, numbered by their names; 0 is none
+        self.groups: dict[tuple[str, bool, bool], list[int]] = {}
+        self.group, self.says_groups = 0, False
+        self.group_numbers: dict[str, int] = {}
         self.current = ""
         self.materials = MaterialReader(companions)
         self.companions = companions
@@ -66,13 +71,23 @@ class _Parser:
             if len(corners) < 3:
                 raise ValueError
             has_uv, has_normal = (all(c[k] >= 0 for c in corners) for k in (1, 2))
-            self.polygons.setdefault((self.current, has_uv, has_normal), []).append(corners)
+            key_of = (self.current, has_uv, has_normal)
+            self.polygons.setdefault(key_of, []).append(corners)
+            self.groups.setdefault(key_of, []).append(self.group)
+        elif key == "s":
+            self._smooth(words[1] if len(words) > 1 else "1")
         elif key == "usemtl":
             self.current = line[line.index(key) + len(key) :].strip()
         elif key == "mtllib":
             name = line.split(None, 1)[1].strip()
             for path in self._libraries(name):
                 self.materials.read(path)
+
+    def _smooth(self, name: str) -> None:
+        """Faces that follow are of this smoothing group, of none by "off" and "0"."""
+        self.says_groups = True
+        off = name.lower() == "off" or not name.strip("0")
+        self.group = 0 if off else self.group_numbers.setdefault(name, len(self.group_numbers) + 1)
 
     def _libraries(self, names: str) -> list[Path]:
         """Files of one name, which may have spaces, or of several with spaces between them."""
@@ -111,14 +126,23 @@ class _Parser:
         for name in dict.fromkeys(key[0] for key in self.polygons):
             if name and name not in self.materials.by_name:
                 self.companions.note(f"material '{name}' is not defined: default material used")
-        meshes = [
+        read = [
             self._mesh(name, has_uv and there[0], has_normal and there[1], polygons)
             for (name, has_uv, has_normal), polygons in self.polygons.items()
         ]
-        meshes, origin = settle(self.materials.placed(meshes, keep_layout), self.companions.note)
+        meshes, origin = settle([mesh for mesh, _ in read], self.companions.note)
+        if not keep_layout:
+            # once a file says anything of smoothing, faces without a group are flat, as the format says;
+            # of one that does not, as scans are, nothing is known
+            groups = [np.array(g)[face] for g, (_, face) in zip(self.groups.values(), read, strict=True)]
+            meshes = shaded(meshes, groups if self.says_groups else None)
+        meshes = self.materials.placed(meshes, keep_layout)
         return Asset(tuple(meshes), self.path.stem, self.companions.notes.lines(), origin=origin)
 
-    def _mesh(self, name: str, has_uv: bool, has_normal: bool, polygons: list[list[tuple[int, int, int]]]) -> Mesh:
+    def _mesh(
+        self, name: str, has_uv: bool, has_normal: bool, polygons: list[list[tuple[int, int, int]]]
+    ) -> tuple[Mesh, NDArray[np.int64]]:
+        """A mesh, and the polygon of each of its faces."""
         indices = np.array([c for p in polygons for c in p], np.int64)
         indices[:, [k for k, has in ((1, has_uv), (2, has_normal)) if not has]] = -1
         of_kind, index = unique_rows(indices + 1)
@@ -132,7 +156,7 @@ class _Parser:
         if any(len(v) < 3 for v in vertices):
             raise InputError(f"{self.path}: a vertex has fewer than three coordinates")
         positions = np.array([v[:3] for v in vertices], np.float64)
-        corners, _ = triangulate(Polygons(np.array([len(p) for p in polygons]), index), positions)
+        corners, polygon = triangulate(Polygons(np.array([len(p) for p in polygons]), index), positions)
         has_color = all(len(v) == 6 for v in vertices)
         uvs = np.array([self.uvs[i] for i in used[:, 1]], np.float32) if has_uv else None
         if uvs is not None:
@@ -140,7 +164,7 @@ class _Parser:
         normals = [self.normals[i] for i in used[:, 2]] if has_normal else []
         if any(len(v) < 3 for v in normals):
             raise InputError(f"{self.path}: a normal has fewer than three coordinates")
-        return Mesh(
+        mesh = Mesh(
             positions=positions,  # type: ignore[arg-type]  # in double precision until they are settled
             faces=index[corners].astype(np.int32),
             normals=_unit(np.array(normals, np.float64)) if has_normal else None,
@@ -150,6 +174,7 @@ class _Parser:
             material=self.materials.by_name.get(name, Material(name=name or "material", roughness=0.8)),
             name=name or self.path.stem,
         )
+        return mesh, polygon
 
 
 def _unit(v: NDArray) -> NDArray[np.float32]:
