@@ -10,7 +10,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from appearance_opt import backend
+from appearance_opt import memory
 from appearance_opt.asset import load, save
 from appearance_opt.asset.height import heights_of
 from appearance_opt.asset.types import Asset, Displacement, Texture
@@ -72,7 +72,7 @@ def test_the_level_of_an_iteration_can_be_replayed() -> None:
 
 
 def test_too_much_is_refused_with_the_number(bumpy: Asset, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(backend, "available_memory", lambda: 1 << 30)
+    monkeypatch.setattr(memory, "available_memory", lambda: 1 << 30)
     message = r"5000 triangles become 1280000, which takes about \d\.\d GiB, and 1\.0 GiB are free"
     with pytest.raises(InputError, match=message) as error:
         simplify(bumpy, None, options(triangles=5000, subdivision=4))
@@ -80,7 +80,7 @@ def test_too_much_is_refused_with_the_number(bumpy: Asset, monkeypatch: pytest.M
 
 
 def test_free_memory_is_known() -> None:
-    free = backend.available_memory()
+    free = memory.available_memory()
     assert free is not None and 2**20 < free < 2**50
 
 

@@ -75,7 +75,7 @@ def test_planted_bugs_stay_visible(fault: Exception, tmp_path: Path, monkeypatch
 
     path = tmp_path / "x.gltf"
     path.write_text(json.dumps(triangle()))
-    monkeypatch.setattr(gltf_read, "local_transform", broken)
+    monkeypatch.setattr(gltf_read._Reader, "asset", broken)
     with pytest.raises(type(fault)) as caught:
         load(path)
     assert caught.value is fault

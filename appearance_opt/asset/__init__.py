@@ -12,6 +12,9 @@ from appearance_opt.errors import InputError
 __all__ = ["Asset", "Displacement", "Material", "Mesh", "Texture", "load", "save"]
 
 READABLE = (".glb", ".gltf", ".usd", ".usda", ".usdc", ".usdz", ".obj", ".ply", ".stl")
+MAX_REFINE = 5
+"""Level to which subdivision surfaces are refined at the most: each makes four faces of one."""
+
 WRITABLE = (".glb", ".gltf", ".usd", ".usda", ".usdc", ".usdz", ".obj")
 
 
@@ -45,6 +48,8 @@ def load(
         raise InputError(f"{path}: unknown format '{suffix}'; readable are {' '.join(READABLE)}")
     if not path.is_file():
         raise InputError(f"{path}: no such file")
+    if not isinstance(refine, int) or not 0 <= refine <= MAX_REFINE:
+        raise InputError(f"--refine {refine}: must be from 0 to {MAX_REFINE}")
     if root is not None and not Path(root).is_dir():
         raise InputError(f"--root {root}: no such folder")
     import numpy as np

@@ -7,12 +7,16 @@ from pathlib import Path, PureWindowsPath
 from typing import TYPE_CHECKING, Literal, TypeVar, get_args
 from urllib.parse import unquote
 
+from appearance_opt.asset import images
+from appearance_opt.asset.budget import Budget
 from appearance_opt.asset.notes import Notes
-from appearance_opt.asset.paths import resolve
+from appearance_opt.asset.paths import read_bytes, resolve
 from appearance_opt.errors import InputError, MissingFileError
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+
+    from numpy.typing import NDArray
 
 MissingTextures = Literal["error", "ignore"]
 
@@ -25,12 +29,13 @@ T = TypeVar("T")
 class Companions:
     """``policy``: refuse an asset that lacks a file, or go on without it. ``root``: folder in which files may
     lie beside that of the file that names them. ``notes``: the reader's notes; each file that was ignored is named
-    there once. ``files``: absolute paths of what was found."""
+    there once. ``files``: absolute paths of what was found. ``budget``: the memory that all of the asset may take."""
 
     policy: MissingTextures = "error"
     root: Path | None = None
     notes: Notes = field(default_factory=Notes)
     files: list[Path] = field(default_factory=list)
+    budget: Budget = field(default_factory=Budget)
 
     def note(self, text: str, kind: str | None = None) -> None:
         """Say something to the user, once; see ``Notes``."""
@@ -72,6 +77,14 @@ class Companions:
             f"{owner}: refers to '{reference[:200]}' outside its own folder, where there is no '{path.name[:80]}'; "
             "copy it beside the file, or allow the folder with --root"
         )
+
+    def picture(self, path: Path) -> NDArray:
+        """Pixels of a picture that was found; see ``images.decode``. Raises InputError."""
+        return self.decoded(read_bytes(path), str(path))
+
+    def decoded(self, data: bytes, name: str) -> NDArray:
+        """The same for a picture in memory, which errors call ``name``."""
+        return images.decode(data, name, self.budget)
 
     def read(self, file: Callable[[], T], instead: str = "the material's constants stand alone") -> T | None:
         """What ``file`` reads; None if it is missing and that is to be ignored. ``instead``: what the note says

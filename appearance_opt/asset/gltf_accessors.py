@@ -6,6 +6,7 @@ import base64
 import binascii
 import json
 import struct
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,9 +23,9 @@ if TYPE_CHECKING:
 
 COMPONENTS = {5120: np.int8, 5121: np.uint8, 5122: np.int16, 5123: np.uint16, 5125: np.uint32, 5126: np.float32}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
-MAX_ZEROS = 1 << 24
-"""Most elements of an accessor without data, which stands for zeros: a few bytes of JSON must not ask for more
-memory than there is."""
+FREE_ZEROS = 1 << 16
+"""Elements that an accessor without data, which stands for zeros, may have in any file. Beyond that it has no more than
+the largest accessor with data: a few bytes of JSON must not ask for any amount of memory and time."""
 _MAGIC, _JSON, _BIN = 0x46546C67, 0x4E4F534A, 0x004E4942
 
 
@@ -88,7 +89,7 @@ class Document:
         kind, width, count = np.dtype(COMPONENTS[a["componentType"]]), WIDTHS[a["type"]], a["count"]
         if "bufferView" in a:
             out = self._elements(a["bufferView"], a.get("byteOffset", 0), kind, width, count)
-        elif count > MAX_ZEROS:
+        elif count > max(FREE_ZEROS, self._most_elements):
             raise InputError(f"{self.path}: accessor {index} has {count} elements but no data; the file is damaged")
         else:
             out = np.zeros((count, width), kind)
@@ -103,6 +104,16 @@ class Document:
                 s["values"]["bufferView"], s["values"].get("byteOffset", 0), kind, width, s["count"]
             )
         return self.scaled(index, out)
+
+    @cached_property
+    def _most_elements(self) -> int:
+        """Elements of the largest accessor that has data."""
+        most = 0
+        for a in self.items("accessors"):
+            if "bufferView" in a:
+                size = np.dtype(COMPONENTS[a["componentType"]]).itemsize * WIDTHS[a["type"]]
+                most = max(most, min(a["count"], len(self.buffer_view(a["bufferView"])[0]) // size))
+        return most
 
     def scaled(self, index: int, stored: NDArray) -> NDArray:
         """What the numbers ``stored`` of an accessor mean: floats in [-1, 1] if it is normalized, else themselves."""

@@ -251,7 +251,7 @@ class MaterialReader:
         if self._tile is None:
             return None
         return udim.read_tile(
-            name, self._tile, self.path, companions, lambda file: images.read(companions.find(file, self.path))
+            name, self._tile, self.path, companions, lambda file: companions.picture(companions.find(file, self.path))
         )
 
     def _image(self, index: int, material: str) -> NDArray:
@@ -260,7 +260,9 @@ class MaterialReader:
             data = bytes(self.document.buffer_view(image["bufferView"])[0])
         else:
             data = self.document.uri(image["uri"])
-        return images.decode(data, f"{self.path}, image {image.get('name') or index} of material '{material}'")
+        return self.document.companions.decoded(
+            data, f"{self.path}, image {image.get('name') or index} of material '{material}'"
+        )
 
 
 def _source(texture: dict[str, Any]) -> int | None:

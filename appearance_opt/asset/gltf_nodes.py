@@ -11,7 +11,7 @@ from appearance_opt.asset.placement import Placement
 from appearance_opt.errors import InputError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterable
 
     from numpy.typing import NDArray
 
@@ -43,6 +43,22 @@ class Nodes:
     def roots(self) -> list[int]:
         """The nodes that are no one's children."""
         return [k for k in range(len(self.nodes)) if k not in self._parents]
+
+    def visits(self, roots: Iterable[int]) -> int:
+        """How many nodes a walk from ``roots`` meets. glTF asks for trees (2.0, 3.5.2); where nodes share children
+        all the same, a walk may be far longer than the file. Raises InputError if a node is its own ancestor."""
+        below: dict[int, int | None] = {}
+
+        def count(index: int) -> int:
+            known = below.get(index, 0)
+            if known is None:
+                raise InputError(f"{self.path}: node {index} is its own ancestor")
+            if not known:
+                below[index] = None
+                below[index] = known = 1 + sum(count(child) for child in self.nodes[index].get("children", []))
+            return known
+
+        return sum(count(root) for root in roots)
 
     def world(self, index: int) -> NDArray[np.float64]:
         """(4, 4) transform of a node. Raises InputError if it is its own ancestor."""

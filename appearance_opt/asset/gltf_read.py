@@ -55,8 +55,10 @@ class _Reader:
     def asset(self) -> Asset:
         self._check_extensions()
         meshes: list[Mesh] = []
-        for root in self._roots():
-            self._visit(root, np.eye(4), meshes, set())
+        roots = self._roots()
+        self.document.companions.budget.take(self.nodes.visits(roots), "nodes", self.path)
+        for root in roots:
+            self._visit(root, np.eye(4), meshes)
         for kind, what in (
             ("skins", "skins: the rest pose is kept, skinning dropped"),
             ("animations", "animations dropped"),
@@ -92,9 +94,7 @@ class _Reader:
             if name not in _READ:
                 self.note(f"extension {name} ignored")
 
-    def _visit(self, index: int, parent: NDArray, meshes: list[Mesh], seen: set[int]) -> None:
-        if index in seen:
-            raise InputError(f"{self.path}: node {index} is its own ancestor")
+    def _visit(self, index: int, parent: NDArray, meshes: list[Mesh]) -> None:
         node = self.document.items("nodes")[index]
         world = parent @ self.nodes.local[index]
         if "mesh" in node:
@@ -105,7 +105,7 @@ class _Reader:
                 found = self._primitive(primitive, k, node, world, name if k == 0 else f"{name}.{k}", weights)
                 meshes += [] if found is None else [found]
         for child in node.get("children", []):
-            self._visit(child, world, meshes, seen | {index})
+            self._visit(child, world, meshes)
 
     def _primitive(
         self,
@@ -134,7 +134,9 @@ class _Reader:
             local = self._read(primitive, _Source(self.document, primitive, weights, shared))
             if self._uses[node["mesh"]] > 1:
                 self._local[key] = local
-        return placed(local, self.nodes.placement(node, world), name)
+        place = self.nodes.placement(node, world)
+        self.document.companions.budget.take_copies(local, place.copies, self.path)
+        return placed(local, place, name)
 
     def _read(self, primitive: dict[str, Any], source: _Source) -> Mesh:
         """A primitive in its own frame, in double precision."""

@@ -19,13 +19,15 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from appearance_opt.asset.budget import Budget
+
 MAX_SIZE = 16384
 """Widest and highest texture read (pixels)."""
 
 
-def decode(data: bytes, name: str) -> NDArray:
-    """Pixels (H, W, C) of an image file in memory; uint8, uint16 or float32 as stored, row 0 on top.
-    Raises InputError when it cannot be read."""
+def decode(data: bytes, name: str, budget: Budget | None = None) -> NDArray:
+    """Pixels (H, W, C) of an image file in memory; uint8, uint16 or float32 as stored, row 0 on top. ``budget``: what
+    they may take. Raises InputError when it cannot be read, or is too large."""
     if not data:
         raise InputError(f"{name}: the image is empty")
     if basis.is_basis(data):
@@ -38,7 +40,7 @@ def decode(data: bytes, name: str) -> NDArray:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / ("image" + suffix)
         path.write_bytes(data)
-        return _open(path, name)
+        return _open(path, name, budget)
 
 
 def read(path: Path) -> NDArray:
@@ -73,7 +75,7 @@ def check_png(data: bytes, name: str) -> None:
     raise InputError(f"{name}: the image is damaged (cut short); export it again")
 
 
-def _open(path: Path, name: str) -> NDArray:
+def _open(path: Path, name: str, budget: Budget | None) -> NDArray:
     import OpenImageIO as oiio
 
     config = oiio.ImageSpec()
@@ -82,12 +84,12 @@ def _open(path: Path, name: str) -> NDArray:
     if source is None:
         raise InputError(f"{name}: not a readable image ({_one_line(oiio.geterror()) or 'unknown format'})")
     try:
-        return _read(source, name)
+        return _read(source, name, budget)
     finally:
         source.close()
 
 
-def _read(source, name: str) -> NDArray:
+def _read(source, name: str, budget: Budget | None) -> NDArray:
     import OpenImageIO as oiio
 
     spec = source.spec()
@@ -95,6 +97,9 @@ def _read(source, name: str) -> NDArray:
         raise InputError(f"{name}: {spec.width} x {spec.height} pixels; at most {MAX_SIZE} x {MAX_SIZE} are supported")
     kind = {oiio.UINT8: oiio.UINT8, oiio.UINT16: oiio.UINT16}.get(spec.format.basetype, oiio.FLOAT)
     channels = min(spec.nchannels, 4)
+    if budget is not None:
+        size = {oiio.UINT8: 1, oiio.UINT16: 2}.get(kind, 4)
+        budget.take_picture(spec.width, spec.height, channels * size, name)
     pixels = source.read_image(0, 0, 0, channels, kind)
     if pixels is None:
         raise InputError(f"{name}: the image is damaged ({_one_line(source.geterror()) or 'cannot be decoded'})")

@@ -206,7 +206,7 @@ class _Statements:
         """None if the file is missing and that is to be ignored, or if it is one in tiles and none is asked for."""
 
         def read(name: str) -> NDArray:
-            return images.read(self.companions.find(name, self.path))
+            return self.companions.picture(self.companions.find(name, self.path))
 
         if not udim.is_tiled(file):
             return self.companions.read(lambda: read(file))

@@ -34,7 +34,7 @@ class Placement:
 
     def repeated(self, values: NDArray | None) -> NDArray | None:
         """(P V, width) what all copies have alike."""
-        return values if values is None or self.skinned or len(self.matrix) == 1 else np.tile(values, (self._copies, 1))
+        return values if values is None or self.skinned or len(self.matrix) == 1 else np.tile(values, (self.copies, 1))
 
     def mirrored(self, vertices: int) -> NDArray[np.bool_]:
         """(P V,) is the mapping of a vertex a reflection?"""
@@ -45,13 +45,14 @@ class Placement:
         if self.skinned:
             turned = self._mirrors[faces[:, 0]][:, None]
             return np.where(turned, faces[:, ::-1], faces).astype(np.int32)
-        out = np.repeat(faces[None], self._copies, axis=0) + (np.arange(self._copies) * vertices)[:, None, None]
+        out = np.repeat(faces[None], self.copies, axis=0) + (np.arange(self.copies) * vertices)[:, None, None]
         if self._mirrors.any():
             out[self._mirrors] = out[self._mirrors][..., ::-1]
         return out.reshape(-1, 3).astype(np.int32)
 
     @property
-    def _copies(self) -> int:
+    def copies(self) -> int:
+        """P: how often a mesh is placed."""
         return 1 if self.skinned else len(self.matrix)
 
     @cached_property

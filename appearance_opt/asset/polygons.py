@@ -10,6 +10,13 @@ from numpy.typing import NDArray
 
 from appearance_opt.asset.normals import accumulate
 
+MOST_CORNERS = 1 << 14
+"""Corners of a face that is not convex: the time to cut ears off one that crosses itself grows with their square."""
+
+SIMPLE = 64
+"""A face of more corners that is at fewer than half as many places is no polygon, and drawn as a fan: ears would take
+a time that grows with the cube of the corners."""
+
 
 @dataclass(frozen=True)
 class Polygons:
@@ -51,7 +58,15 @@ def triangulate(polygons: Polygons, points: NDArray) -> tuple[NDArray[np.int64],
     cut = []
     for f in np.flatnonzero(leaves):
         corners = np.arange(start[f], start[f] + polygons.counts[f])
-        cut.append(corners[_ears(np.asarray(points, np.float64)[polygons.indices[corners]], total[f])])
+        places = np.asarray(points, np.float64)[polygons.indices[corners]]
+        if len(corners) > MOST_CORNERS:
+            raise ValueError(f"a face has {len(corners)} corners, at most {MOST_CORNERS} are supported: triangulate it")
+        if len(corners) > SIMPLE and len(np.unique(places, axis=0)) < len(corners) / 2:
+            leaves[f] = False
+            continue
+        cut.append(corners[_ears(places, total[f])])
+    if not cut:
+        return triangles, face
     kept = ~leaves[face]
     triangles = np.concatenate([triangles[kept], *cut])
     face = np.concatenate([face[kept], np.repeat(np.flatnonzero(leaves), [len(c) for c in cut])])

@@ -195,7 +195,7 @@ class MaterialReader:
         def read(name: str) -> NDArray:
             path = str(self.companions.find(name, owner))
             if path not in self._pixels:
-                self._pixels[path] = images.read(Path(path))
+                self._pixels[path] = self.companions.picture(Path(path))
             return self._pixels[path]
 
         if not udim.is_tiled(text):
@@ -381,9 +381,9 @@ class MaterialReader:
                 opened = Ar.GetResolver().OpenAsset(Ar.ResolvedPath(text))
                 if not opened:
                     raise MissingFileError(f"{self.path}: refers to '{text}', which does not exist")
-                self._pixels[text] = images.decode(bytes(opened.GetBuffer()), text)
+                self._pixels[text] = self.companions.decoded(bytes(opened.GetBuffer()), text)
             else:
-                self._pixels[text] = images.read(self.companions.find(text, self.path))
+                self._pixels[text] = self.companions.picture(self.companions.find(text, self.path))
         return self._pixels[text]
 
 

@@ -35,6 +35,9 @@ _TO_Y_UP = {
     "X": np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]),
 }
 
+_REFINED = ("catmullClark", "loop")
+"""Schemes of subdivision surfaces that are refined."""
+
 _UVS = "uvs:"
 """Before the name of a primvar of texture coordinates, among the attributes of a mesh."""
 
@@ -104,6 +107,25 @@ def _metres_per_unit(stage: Any) -> float:
     return float(root.GetInfo(key)) if root.HasInfo(key) else 0.01
 
 
+def _count_prims(stage: Any) -> int:
+    """Prims of a stage, those of instances counted as often as they are instanced: a walk through instances of
+    instances may be far longer than the file."""
+    from pxr import Usd
+
+    below: dict[str, int] = {}
+
+    def count(root: Any) -> int:
+        path = str(root.GetPath())
+        if path not in below:
+            below[path] = 0
+            prims = list(Usd.PrimRange(root))
+            inside = (count(p.GetPrototype()) for p in prims if p.IsInstance())
+            below[path] = len(prims) + sum(inside)
+        return below[path]
+
+    return count(stage.GetPseudoRoot())
+
+
 @dataclass(frozen=True)
 class _Geometry:
     """A mesh in its own frame. ``values``: positions ("points") and other attributes by name, each with faces of its
@@ -133,6 +155,7 @@ class _Reader:
         from pxr import Usd, UsdGeom
 
         meshes: list[Mesh] = []
+        self.companions.budget.take(_count_prims(self.stage), "prims", self.path)
         prims = iter(Usd.PrimRange.Stage(self.stage, Usd.TraverseInstanceProxies()))
         for prim in prims:
             if prim.IsA(UsdGeom.PointInstancer):
@@ -140,7 +163,7 @@ class _Reader:
                 meshes += self._instances(prim)
             elif prim.IsA(UsdGeom.Gprim) and self._shown(prim):
                 place = self._place([np.array(self._to_world(prim))])
-                meshes += [placed(part, place, part.name) for part in self._parts(prim)]
+                meshes += [self._put(part, place) for part in self._parts(prim)]
         meshes = self.materials.in_one_frame(meshes, self.keep_layout)
         meshes, origin = settle(meshes, self.note)
         return Asset(tuple(meshes), self.path.stem, self.companions.notes.lines(), origin=origin)
@@ -184,6 +207,7 @@ class _Reader:
         number = np.array(instancer.GetProtoIndicesAttr().Get(self.time) or [], np.int64)
         shown = instancer.ComputeMaskAtTime(self.time)
         number = number[np.array(shown, bool)] if len(shown) else number
+        self.companions.budget.take(len(number), "instances", self.path)
         transforms = instancer.ComputeInstanceTransformsAtTime(self.time, self.time)
         each = np.array(transforms, np.float64).reshape(-1, 4, 4)
         world = np.array(self.cache.GetLocalToWorldTransform(prim))
@@ -201,8 +225,13 @@ class _Reader:
                     continue
                 local = np.array(self._to_world(part) * back)
                 place = self._place(local @ each[number == k] @ world)
-                meshes += [placed(_with_normals(one), place, one.name) for one in self._parts(part)]
+                meshes += [self._put(_with_normals(one), place) for one in self._parts(part)]
         return meshes
+
+    def _put(self, mesh: Mesh, place: Placement) -> Mesh:
+        """A mesh at all its places."""
+        self.companions.budget.take_copies(mesh, place.copies, self.path)
+        return placed(mesh, place, mesh.name)
 
     def _place(self, to_world: Any) -> Placement:
         """Where the copies of a mesh are, in metres, Y up; ``to_world``: (P, 4, 4) for rows, as USD has them."""
@@ -259,6 +288,9 @@ class _Reader:
             raise InputError(f"{self.path}, mesh '{prim.GetPath()}': its face counts do not match its indices")
         if len(indices) and (indices.min() < 0 or indices.max() >= len(points)):
             raise InputError(f"{self.path}, mesh '{prim.GetPath()}': faces refer to points that do not exist")
+        refined = 4**self.refine if str(mesh.GetSubdivisionSchemeAttr().Get()) in _REFINED else 1
+        self.companions.budget.take(len(points) * refined, "vertices", self.path)
+        self.companions.budget.take(len(indices) * refined, "faces", self.path)
         polygons = Polygons(counts, indices)
         face_ids = np.arange(len(counts))
         values = {"points": (points, polygons)}
@@ -267,7 +299,7 @@ class _Reader:
         scheme = str(mesh.GetSubdivisionSchemeAttr().Get())
         if scheme in ("none", "bilinear") and "normals" not in values and not self.keep_layout:
             values["normals"] = _facets(points, polygons, flipped)
-        if scheme in ("catmullClark", "loop") and self.refine > 0:
+        if scheme in _REFINED and self.refine > 0:
             values.pop("normals", None)
             if scheme == "loop":
                 self.note("Loop subdivision surfaces are refined by the rules of Catmull-Clark")

@@ -36,7 +36,10 @@ def triangles(prim: Any, time: Any) -> Triangles | None:
 
     def number(name: str, default: float) -> float:
         value = prim.GetAttribute(name).Get(time)
-        return default if value is None else float(value)
+        size = default if value is None else float(value)
+        if not 0 < size < np.inf:
+            raise ValueError(f"the {name} of '{prim.GetPath()}' is {size}")
+        return size
 
     import trimesh
 

@@ -22,6 +22,9 @@ if TYPE_CHECKING:
     from appearance_opt.asset.types import Material, Mesh, Texture, Wrap
     from appearance_opt.asset.udim import Tile
 
+ASSET_TEXELS = 1 << 27
+"""Texels of all resampled textures of an asset at most: a small picture, repeated often, may stand for any number."""
+
 MAX_TEXELS = 1 << 25
 """Texels of a resampled texture at most."""
 
@@ -125,7 +128,7 @@ def unified(
     """The meshes with the transforms of their textures applied, and textures brought under one set of coordinates, one
     transform and one wrap mode where they differ. ``frames_of``: by ``id`` of a material, the frame of each of its
     textures by field name; materials that are not there stay. ``note``: told what was resampled."""
-    out = list(meshes)
+    out, left = list(meshes), ASSET_TEXELS
     for own in _by_material(meshes):
         material = meshes[own[0]].material
         frames = {n: f for n, f in frames_of.get(id(material), {}).items() if getattr(material, n) is not None}
@@ -145,8 +148,9 @@ def unified(
             differ = "transform or wrap mode"
         if differ:
             told = f"material '{material.name}': its textures differ in {differ}"
-            found = _resampled_alike(told, [meshes[k] for k in own], textures, frames, note)
+            found = _resampled_alike(told, [meshes[k] for k in own], textures, frames, left, note)
             if found is not None:
+                left -= sum(t.pixels.shape[0] * t.pixels.shape[1] for t in found.textures.values())
                 placed, new = found.uvs, replace(material, **found.textures)  # type: ignore[arg-type]
                 own_tangents = found.keeps_tangents
         for k, uv in zip(own, placed, strict=True):
@@ -183,18 +187,20 @@ def _resampled_alike(
     meshes: Sequence[Mesh],
     textures: Mapping[str, Texture],
     frames: Mapping[str, Frame],
+    most: int,
     note: Callable[[str], None],
 ) -> Resampled | None:
-    """The textures of ``meshes`` under one frame, or None if they would be too large; ``note`` is told, after
-    ``told``."""
+    """The textures of ``meshes`` under one frame, or None if each would be too large, or all together larger than
+    ``most`` texels; ``note`` is told, after ``told``."""
+    each = min(MAX_TEXELS, most // len(textures))
     if len({f.coordinates for f in frames.values()}) > 1:
         from appearance_opt.asset.uv_sets import in_one_set
 
-        found = in_one_set(meshes, textures, frames)
+        found = in_one_set(meshes, textures, frames, each)
     else:
         # tangents follow the coordinates, and the normal map follows the tangents
         leading = "normal_texture" if "normal_texture" in textures else next(iter(textures))
-        found = in_one_frame([np.asarray(m.uvs) for m in meshes], textures, frames, leading)
+        found = in_one_frame([np.asarray(m.uvs) for m in meshes], textures, frames, leading, each)
     if found is None:
         note(f"{told}, and are too large to be resampled: the first one's are used for all")
     else:
@@ -231,9 +237,14 @@ def alike(uvs: Sequence[NDArray], textures: Mapping[str, Texture], frames: Mappi
 
 
 def in_one_frame(
-    uvs: Sequence[NDArray], textures: Mapping[str, Texture], frames: Mapping[str, Frame], leading: str
+    uvs: Sequence[NDArray],
+    textures: Mapping[str, Texture],
+    frames: Mapping[str, Frame],
+    leading: str,
+    most: int = MAX_TEXELS,
 ) -> Resampled | None:
-    """Textures that read the same set of coordinates under one transform, or None if the images would be too large.
+    """Textures that read the same set of coordinates under one transform, or None if the images would have more than
+    ``most`` texels.
 
     ``frames``: those of the textures, on one set of coordinates. ``leading``: the texture whose frame the others are
     brought to; where it is the finest, it is copied texel by texel. The others are read bilinearly.
@@ -252,7 +263,7 @@ def in_one_frame(
     placed = [frames[leading].of(uv) * size for uv in uvs]
     low = np.floor(np.min([p.min(axis=0) for p in placed], axis=0)) - 1
     extent = np.ceil(np.max([p.max(axis=0) for p in placed], axis=0)) + 1 - low
-    if not extent.prod() <= MAX_TEXELS:  # nor for coordinates that are no numbers
+    if not extent.prod() <= most:  # nor for coordinates that are no numbers
         return None
     to_uv = np.concatenate([back, -back @ frame[:, 2:]], axis=1)
     new = {n: _resampled(t, frames[n].matrix, to_uv, low, size, extent) for n, t in textures.items()}
@@ -264,15 +275,49 @@ def _resampled(
 ) -> Texture:
     columns, rows = int(extent[0]), int(extent[1])
     out = np.empty((rows, columns, texture.pixels.shape[2]), texture.pixels.dtype)
+    whole = composed(frame, to_uv)
     step = max(1, BAND // columns)
     for start in range(0, rows, step):
-        y, x = np.meshgrid(np.arange(start, min(start + step, rows)), np.arange(columns), indexing="ij")
-        centres = (np.stack([x.ravel(), y.ravel()], axis=1) + 0.5 + low) / size
-        values = bilinear(texture, apply(frame, apply(to_uv, centres)))
+        row, column = np.arange(start, min(start + step, rows)), np.arange(columns)
+        if abs(whole[0, 1]) + abs(whole[1, 0]) < 1e-12:
+            u = whole[0, 0] * (column + 0.5 + low[0]) / size[0] + whole[0, 2]
+            v = whole[1, 1] * (row + 0.5 + low[1]) / size[1] + whole[1, 2]
+            values = _bilinear_grid(texture, u, v)
+        else:
+            y, x = np.meshgrid(row, column, indexing="ij")
+            centres = (np.stack([x.ravel(), y.ravel()], axis=1) + 0.5 + low) / size
+            values = bilinear(texture, apply(whole, centres)).reshape(*x.shape, -1)
         if out.dtype.kind == "u":
             values = np.rint(values)
-        out[start : start + step] = values.reshape(*x.shape, -1).astype(out.dtype)
+        out[start : start + step] = values.astype(out.dtype)
     return replace(texture, pixels=out, wrap=("clamp", "clamp"))
+
+
+def _bilinear_grid(texture: Texture, u: NDArray, v: NDArray) -> NDArray:
+    """Stored values (V, U, C) at all pairs of texture coordinates of an upright grid: what ``bilinear`` gives, at the
+    price of copying texels where they are met at their middles."""
+    height, width = texture.pixels.shape[:2]
+    out: NDArray | None = None
+    for row, down in _taps(v, height, texture.wrap[1]):
+        for column, across in _taps(u, width, texture.wrap[0]):
+            texels = texture.pixels[row[:, None], column]
+            if (down == 1).all() and (across == 1).all():
+                return texels
+            part = texels * (down[:, None, None] * across[:, None])
+            out = part if out is None else out + part
+    assert out is not None
+    return out
+
+
+def _taps(at: NDArray, size: int, mode: Wrap) -> list[tuple[NDArray[np.int64], NDArray[np.float64]]]:
+    """(numbers of texels, their weights) along one axis: of both neighbours, or of one where none lies between."""
+    # the rounding of a frame there and back must not mix neighbours
+    at = np.round(at * size - 0.5, 6)
+    corner = np.floor(at)
+    fraction = at - corner
+    first = corner.astype(np.int64)
+    taps = [(_wrapped(first, size, mode), 1 - fraction)]
+    return taps + [(_wrapped(first + 1, size, mode), fraction)] if fraction.any() else taps
 
 
 def bilinear(texture: Texture, uv: NDArray) -> NDArray[np.float64]:

@@ -36,9 +36,10 @@ SAMPLES = 20000
 
 
 def in_one_set(
-    meshes: Sequence[Mesh], textures: Mapping[str, Texture], frames: Mapping[str, Frame]
+    meshes: Sequence[Mesh], textures: Mapping[str, Texture], frames: Mapping[str, Frame], most: int = MAX_TEXELS
 ) -> Resampled | None:
-    """The textures drawn into the layout of one of their sets of coordinates, or None if the images would be too large.
+    """The textures drawn into the layout of one of their sets of coordinates, or None if the images would have more
+    than ``most`` texels.
 
     ``meshes``: all that wear the material, their sets side by side (``uv_frames.Frame``). Texels that no face uses hold
     what the nearest face continues to.
@@ -52,7 +53,7 @@ def in_one_set(
         return None
     while multiple >= 1:
         low, extent = _box(placed * multiple)
-        if extent.prod() <= MAX_TEXELS:
+        if extent.prod() <= most:
             break
         multiple -= 1
     else:

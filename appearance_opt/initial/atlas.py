@@ -19,6 +19,9 @@ GUTTER = 4
 """Empty texels between charts, enough for one mip level and its bilinear lookups. With half as many, or half as many
 again, starts of chess_king, spot and flight_helmet are 0.12 dB worse to 0.04 dB better."""
 
+FLATTEST = 1e-2
+"""Height of the chart of a single thin face at the least, as a part of its longest side."""
+
 FILLED, TRIES, SMALLEST = 0.6, 3, 0.5
 """First guess at the share of a texture that charts fill, how often the length of texels that follows from it is
 corrected, and down to which part of it. Beyond that the gutters become narrower."""
@@ -49,13 +52,44 @@ def charted(positions: NDArray, faces: NDArray) -> LatentMesh:
     atlas.generate(chart_options=chart, pack_options=_pack_options(1024, GUTTER, 0.0))
     vertex, frames, uvs = atlas[0]
     # xatlas stretches the texture, which is as wide and high as it likes, to the unit square
-    side = np.array([atlas.width, atlas.height], np.float32) / np.float32(atlas.texels_per_unit)
-    return LatentMesh(
+    side = np.array([atlas.width, atlas.height], np.float32) / np.float32(max(atlas.texels_per_unit, 1e-30))
+    charts = LatentMesh(
         positions=np.asarray(positions, np.float32),
         faces=np.asarray(faces, np.int32),
         frame_vertex=np.asarray(vertex, np.int32),
         frame_faces=np.asarray(frames, np.int32),
-        uvs=np.asarray(uvs, np.float32) * side,
+        uvs=np.nan_to_num(np.asarray(uvs, np.float32)) * side,
+    )
+    left = uv_areas(charts) <= 0
+    return _with_single_faces(charts, left, (positions - centre) / scale) if left.any() else charts
+
+
+def _with_single_faces(charts: LatentMesh, left: NDArray[np.bool_], positions: NDArray) -> LatentMesh:
+    """The charts, and one for each of the faces that are ``left``: xatlas gives none to faces whose area it takes for
+    nothing. ``positions`` (V, 3) in the units of the charts."""
+    corners = charts.faces[left]
+    # with the longest side first, and no lower than ``FLATTEST`` of it
+    p = positions[corners]
+    longest = np.argmax(np.linalg.norm(np.roll(p, -1, axis=1) - p, axis=2), axis=1)
+    order = (longest[:, None] + np.arange(3)) % 3
+    a, b, c = np.moveaxis(np.take_along_axis(p, order[..., None], axis=1), 1, 0)
+    base = np.maximum(np.linalg.norm(b - a, axis=1), 1e-12)
+    along = np.sum((c - a) * (b - a), axis=1) / base
+    height = np.sqrt(np.maximum(np.sum((c - a) ** 2, axis=1) - along**2, 0))
+    flat = np.zeros((len(p), 3, 2))
+    flat[:, 1, 0], flat[:, 2, 0] = base, np.clip(along, 0, base)
+    flat[:, 2, 1] = np.maximum(height, FLATTEST * base)
+    # side by side, beyond the others: charts that meet in UV space are one to the packer
+    flat[..., 0] += (charts.uvs.max(initial=0) + 2 * np.cumsum(base) - base)[:, None]
+    number = len(charts.uvs) + np.arange(3 * len(p)).reshape(-1, 3)
+    frames = charts.frame_faces.copy()
+    frames[left] = np.take_along_axis(number, np.argsort(order, axis=1), axis=1)
+    vertex = np.take_along_axis(corners, order, axis=1).ravel()
+    return replace(
+        charts,
+        frame_vertex=np.concatenate([charts.frame_vertex, vertex]).astype(np.int32),
+        frame_faces=frames.astype(np.int32),
+        uvs=np.concatenate([charts.uvs, flat.reshape(-1, 2)]).astype(np.float32),
     )
 
 
@@ -69,7 +103,10 @@ def packed(
     size = np.ones(len(charts.uvs), np.float32)
     size[charts.frame_faces.ravel()] = np.repeat(scale, 3)
     scaled = replace(charts, uvs=charts.uvs * size[:, None])
-    guess = texels = resolution * (FILLED / max(float(uv_areas(scaled).sum()), 1e-12)) ** 0.5
+    # the packer has absolute thresholds, too: give it charts of unit area in all
+    area = float(uv_areas(scaled).sum())
+    scaled = replace(scaled, uvs=(scaled.uvs / max(area, 1e-30) ** 0.5).astype(np.float32))
+    guess = texels = resolution * FILLED**0.5
     for _ in range(TRIES):
         # the packer keeps lengths and makes the texture as large as it has to, which is then scaled
         atlas = _placed(scaled, _pack_options(resolution, gutter, texels))

@@ -11,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 from scipy.ndimage import median_filter
 
-from appearance_opt import backend
+from appearance_opt import memory
 from appearance_opt.asset import save
 from appearance_opt.asset.height import displacement_of, height_png
 from appearance_opt.asset.paths import replacing
@@ -60,7 +60,7 @@ BYTES_AT_LEAST = 1 << 29
 
 def require_memory(triangles: int, options: CommonOptions) -> None:
     """Raise InputError with the numbers if tessellating ``triangles`` would exceed the memory that is free."""
-    free = backend.available_memory()
+    free = memory.available_memory()
     if not options.displaced or free is None:
         return
     counts = {level: triangles * 4**level for level in options.levels()}
