@@ -355,20 +355,24 @@ def inspect(
     from dataclasses import asdict
 
     from appearance_opt.asset import load
+    from appearance_opt.asset.alpha import counted
     from appearance_opt.asset.validate import inspected
 
     given = {"variants": _variants(variant), "missing_textures": missing_textures, "root": root}
     asset = load(source, refine=refine, mend=False, **given)  # type: ignore[arg-type]
     counts, asset = inspected(asset, str(source))
-    found = {"meshes": len(asset.meshes), **asdict(counts), "notes": list(asset.notes)}
+    alpha = {kind: asdict(share) for kind, share in counted(asset).items()}
+    found = {"meshes": len(asset.meshes), **asdict(counts), "alpha": alpha, "notes": list(asset.notes)}
     if as_json:
         import json
 
         print(json.dumps(found, indent=1))
         return
     for name, value in found.items():
-        if name != "notes":
+        if name not in ("alpha", "notes"):
             print(f"{name.replace('_', ' '):22} {value}")
+    for kind, share in alpha.items():
+        print(f"{kind:22} {share['meshes']} meshes, {share['triangles']} triangles: {share['becomes']}")
     for note in asset.notes:
         print(f"note: {note}")
 

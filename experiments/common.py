@@ -78,10 +78,12 @@ class Framed:
     ``reference`` and the ``sampler`` of its views."""
 
     def __init__(self, asset: Asset, seed: int = 0) -> None:
+        from appearance_opt.jobs.parts import split
         from appearance_opt.jobs.simplify import in_frame, support
         from appearance_opt.reference.mesh import MeshReference
         from appearance_opt.views import ViewSampler, framing
 
+        asset = split(asset, asset.name, "fit").fitted
         self.frame = framing(asset.points())
         self.asset = in_frame(asset, *self.frame)
         self.reference = MeshReference(self.asset)

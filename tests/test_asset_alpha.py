@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from appearance_opt.asset import load, save
-from appearance_opt.asset.alpha import counted, coverage, kind_of
+from appearance_opt.asset.alpha import Share, counted, coverage, kind_of
 from appearance_opt.asset.types import Asset, Material, Mesh, Texture, Volume
 from appearance_opt.asset.validate import repair
+from appearance_opt.cli import inspect
 
 SQUARE = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], np.float32)
 FACES = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
@@ -130,7 +131,7 @@ def test_meshes_of_one_material_are_told_apart() -> None:
     got = repair(Asset((card(LEAF, name="leaf"), card(LEAF, RIGHT, name="twig"), card(LEAF, RIGHT, name="bud"))), "x")
     assert [m.material.alpha_mode for m in got.meshes] == ["mask", "opaque", "opaque"]
     assert got.meshes[1].material is got.meshes[2].material
-    assert counted(got) == {"opaque": (2, 4), "mask": (1, 2)}
+    assert counted(got) == {"opaque": Share(2, 4, "fitted"), "mask": Share(1, 2, "kept as it is")}
     assert len(got.notes) == 1
     # repeated: the period in which a face lies does not matter, and across its border lies the other half
     repeating = replace(LEAF, base_color_texture=replace(picture(), wrap=("repeat", "repeat")))
@@ -145,3 +146,13 @@ def test_many_names_are_counted() -> None:
         "materials that speak of transparency are opaque wherever they are used, and count as that: "
         "'m0', 'm1', 'm2', 'm3', 'm4' and 4 more",
     )
+
+
+def test_inspect_says_what_becomes_of_each(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    cards = [card(m, name=m.name) for m in (LEAF, SMOKE, PANE, Material("wall"))]
+    save(Asset((*cards, card(LEAF, RIGHT))), tmp_path / "x.glb")
+    inspect(tmp_path / "x.glb")
+    lines = [" ".join(line.split()) for line in capsys.readouterr().out.splitlines()]
+    assert "opaque 2 meshes, 4 triangles: fitted" in lines
+    assert "mask 1 meshes, 2 triangles: kept as it is" in lines
+    assert "blend 2 meshes, 4 triangles: kept as it is" in lines

@@ -27,6 +27,9 @@ OPAQUE = 1 - 1.5 / 255
 """Alpha from which on nothing is seen through: one step of eight bits below 1."""
 
 
+FITTED, KEPT = "fitted", "kept as it is"
+"""What ``simplify`` does with a part."""
+
 NAMED = 5
 """Names that a note lists before it counts."""
 
@@ -71,10 +74,21 @@ def coverage(material: Material) -> tuple[float, Texture | None]:
     return factor, Texture(values, "linear", alpha.wrap)
 
 
-def counted(asset: Asset) -> dict[Kind, tuple[int, int]]:
-    """(meshes, triangles) of each kind that an asset has."""
+@dataclass(frozen=True)
+class Share:
+    """How much of an asset is of one kind, and what ``simplify`` does with it."""
+
+    meshes: int
+    triangles: int
+    becomes: str
+
+
+def counted(asset: Asset) -> dict[Kind, Share]:
+    """The share of each kind that an asset has."""
     found = [(kind_of(m.material), len(m.faces)) for m in asset.meshes]
-    return {k: (len(n), sum(n)) for k in KINDS if (n := [count for kind, count in found if kind == k])}
+    shares = {kind: [count for k, count in found if k == kind] for kind in KINDS}
+    becomes = {kind: FITTED if kind == "opaque" else KEPT for kind in KINDS}
+    return {k: Share(len(n), sum(n), becomes[k]) for k, n in shares.items() if n}
 
 
 def settled(asset: Asset) -> Asset:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from appearance_opt.asset import Asset, load
 from appearance_opt.asset.types import Mesh, Texture, linear_to_srgb
+from appearance_opt.jobs.parts import split
 from appearance_opt.jobs.simplify import in_frame
 from appearance_opt.reference.mesh import MeshReference
 from appearance_opt.render.deferred import Grid
@@ -35,7 +36,7 @@ def compare(path: Path, resolution: int = 256, normal_maps: bool = False) -> Com
     BSDF ``normalmap``, which builds frames from the texture coordinates of each triangle, where glTF has MikkTSpace's
     smooth tangents. Its frames are right-handed: faces with mirrored coordinates get a map with the green turned
     over."""
-    asset = load(path)
+    asset = split(load(path), str(path), "compare").fitted  # the peer draws no transparency
     frame = framing(asset.points())
     asset = in_frame(asset, *frame)
     if not normal_maps:
