@@ -10,13 +10,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from appearance_opt.asset import load, usd_read, uv_frames, validate
+from appearance_opt.asset import batch, load, usd_read, uv_frames, validate
 from appearance_opt.asset.gltf_accessors import Document
 from appearance_opt.asset.gltf_read import _Reader
 from appearance_opt.asset.notes import LINES, Notes
 from appearance_opt.asset.rows import count_unique_rows, ranked, unique_rows
-from appearance_opt.asset.types import Asset, Material, Mesh
+from appearance_opt.asset.types import Asset, Material, Mesh, Texture
 from appearance_opt.asset.validate import Validation
+from appearance_opt.reference import mesh as mesh_reference
+from appearance_opt.render import texture
 from tests.conftest import grid_sphere
 from tests.test_asset_gltf import write_glb
 from tests.test_asset_gltf_nodes import ball, document
@@ -27,9 +29,9 @@ def count_calls(monkeypatch: pytest.MonkeyPatch, owner: object, name: str) -> Co
     calls: Counter = Counter()
     original = getattr(owner, name)
 
-    def counted(*arguments: object) -> object:
+    def counted(*arguments: object, **named: object) -> object:
         calls[str(arguments[1] if isinstance(owner, type) else name)[:200]] += 1
-        return original(*arguments)
+        return original(*arguments, **named)
 
     monkeypatch.setattr(owner, name, counted)
     return calls
@@ -246,3 +248,45 @@ def test_instances_of_usd_are_read_once(tmp_path: Path, monkeypatch: pytest.Monk
     alone, instances = asset.meshes[0], asset.meshes[-1]
     every = instances.normals.reshape(count, -1, 3)
     np.testing.assert_allclose(every, np.broadcast_to(alone.normals, every.shape), atol=1e-6)
+
+
+def test_many_meshes_are_merged_in_one_go_as_each_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Normals and tangents of touching meshes do not mix."""
+    positions, faces = (np.array(a) for a in ball(1))
+    uvs = positions[:, :2] * np.float32(0.4)
+    bump = Texture(np.full((1, 1, 3), 128, np.uint8))
+    wearing = Material(normal_texture=bump)
+    kinds: list[dict] = [
+        {}, {"uvs": uvs, "material": wearing}, {"uvs": uvs, "normals": positions, "material": wearing},
+        {"colors": np.full((len(positions), 3), 0.25, np.float32)},
+    ]  # fmt: skip
+    # open fans of the ball: their borders would be smoothed across if they were taken for one surface
+    meshes = []
+    for k in range(40):
+        used, corners = np.unique(faces[2 * k : 2 * k + 2], return_inverse=True)
+        given = {n: v[used] if isinstance(v, np.ndarray) else v for n, v in kinds[k % 4].items()}
+        meshes.append(Mesh(positions[used], corners.reshape(-1, 3).astype(np.int32), **given))
+    numbers = [m.material is wearing for m in meshes]
+    each = [mesh_reference.merge(Asset((m,)), [n], True) for m, n in zip(meshes, numbers, strict=True)]
+    calls = count_calls(monkeypatch, batch, "summed_normals")
+    every = mesh_reference.merge(Asset(tuple(meshes)), numbers, True)
+    assert calls.total() == 1
+    np.testing.assert_array_equal(every.material, np.repeat(numbers, 2))
+    for name in ("positions", "normals", "uvs", "tangents"):
+        own = np.concatenate([getattr(m, name)[m.faces] for m in each])
+        np.testing.assert_allclose(getattr(every, name)[every.faces], own, atol=1e-6)
+    expected = np.repeat([0.25 if k % 4 == 3 else 1.0 for k in range(40)], 2)
+    np.testing.assert_array_equal(every.colors[every.faces[:, 0], 0], expected.astype(np.float32))
+
+
+def test_materials_of_one_texel_are_uploaded_together(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(0)
+    bases = [rng.random((n, n, 8)).astype(np.float32) for n in (1, 1, 2, 1, 1, 1)]
+    joined: list[int] = []
+    concat = texture.dr.concat
+    monkeypatch.setattr(texture.dr, "concat", lambda parts: joined.append(len(parts)) or concat(parts))
+    pyramid = texture.build_pyramid(bases, [0] * len(bases))
+    assert joined == [4]  # two texels, two levels of the picture, three texels
+    texels = np.array(pyramid.texels).reshape(-1, 8)
+    for base, offsets in zip(bases, pyramid.layout.offsets, strict=True):
+        np.testing.assert_array_equal(texels[offsets[0] : offsets[0] + base[..., 0].size], base.reshape(-1, 8))

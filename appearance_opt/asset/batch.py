@@ -8,8 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from appearance_opt.asset.normals import split_where_cancelled, summed_normals
+
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
     from numpy.typing import NDArray
 
@@ -107,3 +109,25 @@ class Batch:
 def in_range(mesh: Mesh) -> bool:
     """Do all its corners exist? (If not, ``repair`` refuses it, and counts them.)"""
     return not len(mesh.faces) or (mesh.faces.min() >= 0 and mesh.faces.max() < len(mesh.positions))
+
+
+def smoothed(meshes: Sequence[Mesh]) -> list[Mesh]:
+    """The meshes, those without normals with angle-weighted ones (see ``summed_normals``)."""
+
+    def filled(batch: Batch) -> list[Mesh]:
+        positions, faces = batch.joined("positions"), batch.faces
+        normals = summed_normals(positions, faces, mesh_of=batch.mesh_of_vertex)
+        index, faces, normals = split_where_cancelled(positions, faces, normals)
+        return batch.reindexed(index, faces, normals=normals, tangents=None)
+
+    return replaced(meshes, [m.normals is None for m in meshes], filled)
+
+
+def replaced(meshes: Sequence[Mesh], chosen: Sequence[bool], change: Callable[[Batch], list[Mesh]]) -> list[Mesh]:
+    """The meshes, those that are chosen as ``change`` makes them, all in one go."""
+    out = list(meshes)
+    numbers = [k for k, yes in enumerate(chosen) if yes]
+    if numbers:
+        for k, mesh in zip(numbers, change(Batch([meshes[k] for k in numbers])), strict=True):
+            out[k] = mesh
+    return out

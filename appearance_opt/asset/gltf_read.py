@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from appearance_opt.asset import uv_frames
-from appearance_opt.asset.batch import Batch, in_range
+from appearance_opt.asset.batch import Batch, in_range, replaced
 from appearance_opt.asset.gltf_accessors import Document
 from appearance_opt.asset.gltf_draco import DRACO, Compressed
 from appearance_opt.asset.gltf_materials import READ_EXTENSIONS, MaterialReader
@@ -157,16 +157,15 @@ class _Reader:
 
     def _flat_where_needed(self, meshes: list[Mesh]) -> list[Mesh]:
         """The meshes with flat normals where they have none, all in one go."""
-        lacking = [k for k, m in enumerate(meshes) if m.normals is None and in_range(m)]
-        if not lacking:
-            return meshes
-        self.note("meshes without normals are shaded flat, as glTF 2.0 asks")
-        batch = Batch([meshes[k] for k in lacking])
-        index, faces, normals = flat_normals(batch.joined("positions"), batch.faces)
-        out = list(meshes)
-        for k, mesh in zip(lacking, batch.reindexed(index, faces, normals=normals, tangents=None), strict=True):
-            out[k] = mesh
-        return out
+        lacking = [m.normals is None and in_range(m) for m in meshes]
+        if any(lacking):
+            self.note("meshes without normals are shaded flat, as glTF 2.0 asks")
+
+        def flat(batch: Batch) -> list[Mesh]:
+            index, faces, normals = flat_normals(batch.joined("positions"), batch.faces)
+            return batch.reindexed(index, faces, normals=normals, tangents=None)
+
+        return replaced(meshes, lacking, flat)
 
 
 class _Source:

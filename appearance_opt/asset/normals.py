@@ -15,6 +15,11 @@ def weld(positions: NDArray) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     return first, place.ravel()
 
 
+def apart(rows: NDArray, mesh_of: NDArray | None) -> NDArray:
+    """Rows (N, K) that are equal only within one mesh: with its number, below 2^24, as another column."""
+    return rows if mesh_of is None else np.concatenate([rows, mesh_of[:, None].astype(rows.dtype)], axis=1)
+
+
 CANCELLED = 1e-6
 """Unit vectors cancel when the length of their weighted sum is at most this share of the weights: rounding leaves
 1e-7 in single precision."""
@@ -31,10 +36,13 @@ def vertex_normals(positions: NDArray, faces: NDArray, welded: bool = False) -> 
     return out
 
 
-def summed_normals(positions: NDArray, faces: NDArray, welded: bool = False) -> NDArray[np.float32]:
-    """The same, but zero where there is no such normal."""
+def summed_normals(
+    positions: NDArray, faces: NDArray, welded: bool = False, mesh_of: NDArray | None = None
+) -> NDArray[np.float32]:
+    """The same, but zero where there is no such normal. ``mesh_of`` (V,): vertices of different meshes
+    share nothing."""
     p = np.asarray(positions, np.float64)
-    place = np.arange(len(p)) if welded else weld(positions)[1]
+    place = np.arange(len(p)) if welded else weld(apart(positions, mesh_of))[1]
     corners = [p[faces[:, k]] for k in range(3)]
     normal = unit(np.cross(corners[1] - corners[0], corners[2] - corners[0]))
     total = np.zeros((int(place.max()) + 1 if len(place) else 0, 4))

@@ -5,13 +5,14 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from appearance_opt.asset.normals import accumulate, corner_angle, unit
+from appearance_opt.asset.normals import accumulate, apart, corner_angle, unit
 
 
 def split_and_tangents(
-    positions: NDArray, normals: NDArray, uvs: NDArray, faces: NDArray
+    positions: NDArray, normals: NDArray, uvs: NDArray, faces: NDArray, mesh_of: NDArray | None = None
 ) -> tuple[NDArray[np.intp], NDArray[np.int32], NDArray[np.float32]]:
-    """Tangents of a mesh with texture coordinates.
+    """Tangents of a mesh with texture coordinates; or of several in common arrays, where ``mesh_of`` (V,)
+    says which vertex belongs to which.
 
     Per face corner, the direction of growing u is projected on the plane of the vertex normal,
     normalised, weighted by the corner's angle in that plane and summed over the corners that share
@@ -25,7 +26,8 @@ def split_and_tangents(
     mirrored, usable, along_u = _per_face(positions, uvs, faces)
     vertex_index, new_faces = _split(faces, mirrored, len(positions))
     n = np.asarray(normals, np.float64)[vertex_index]
-    group, groups = _groups(positions[vertex_index], normals[vertex_index], uvs[vertex_index], new_faces, mirrored)
+    own = None if mesh_of is None else mesh_of[vertex_index]
+    group, groups = _groups(positions[vertex_index], normals[vertex_index], uvs[vertex_index], new_faces, mirrored, own)
     p = np.asarray(positions, np.float64)
     total = np.zeros((groups, 3))
     for k in range(3):
@@ -67,13 +69,18 @@ def _split(faces: NDArray, mirrored: NDArray, count: int) -> tuple[NDArray[np.in
 
 
 def _groups(
-    positions: NDArray, normals: NDArray, uvs: NDArray, faces: NDArray, mirrored: NDArray
+    positions: NDArray,
+    normals: NDArray,
+    uvs: NDArray,
+    faces: NDArray,
+    mirrored: NDArray,
+    mesh_of: NDArray | None,
 ) -> tuple[NDArray[np.intp], int]:
-    """Vertices that are equal in all attributes and handedness share a tangent."""
+    """Vertices of a mesh that are equal in all attributes and handedness share a tangent."""
     hand = np.zeros(len(positions), np.float32)
     hand[faces.ravel()] = np.repeat(mirrored, 3)
     rows = np.concatenate([positions, normals, uvs, hand[:, None]], axis=1).astype(np.float32) + 0.0
-    rows = np.ascontiguousarray(rows)
+    rows = np.ascontiguousarray(apart(rows, mesh_of))
     keys = rows.view(np.dtype((np.void, rows.dtype.itemsize * rows.shape[1]))).ravel()
     unique, group = np.unique(keys, return_inverse=True)
     return group.ravel(), len(unique)

@@ -11,8 +11,9 @@ import numpy as np
 
 from appearance_opt.asset import usd_shapes, uv_frames
 from appearance_opt.asset.alpha import OPAQUE
+from appearance_opt.asset.batch import smoothed
 from appearance_opt.asset.companions import Companions
-from appearance_opt.asset.normals import accumulate, split_where_cancelled, summed_normals, unit
+from appearance_opt.asset.normals import accumulate, unit
 from appearance_opt.asset.origin import settle
 from appearance_opt.asset.paths import check_inside, read_bytes
 from appearance_opt.asset.placement import Placement, placed
@@ -225,7 +226,8 @@ class _Reader:
                     continue
                 local = np.array(self._to_world(part) * back)
                 place = self._place(local @ each[number == k] @ world)
-                meshes += [self._put(_with_normals(one), place) for one in self._parts(part)]
+                # normals of its own for each, so that instances which touch are not smoothed across
+                meshes += [self._put(one, place) for one in smoothed(self._parts(part))]
         return meshes
 
     def _put(self, mesh: Mesh, place: Placement) -> Mesh:
@@ -427,17 +429,6 @@ def _facets(points: NDArray, polygons: Polygons, flipped: bool) -> tuple[NDArray
     normals = unit(-total if flipped else total).astype(np.float32)
     of_kind, index = unique_rows(ranked(normals))
     return normals[of_kind].astype(np.float64), Polygons(polygons.counts, index[face])
-
-
-def _with_normals(mesh: Mesh) -> Mesh:
-    """A mesh that has normals, so that copies of it which touch are not smoothed across."""
-    if mesh.normals is not None:
-        return mesh
-    index, faces, normals = split_where_cancelled(
-        mesh.positions, mesh.faces, summed_normals(mesh.positions, mesh.faces)
-    )
-    uvs, colors = (None if v is None else v[index] for v in (mesh.uvs, mesh.colors))
-    return replace(mesh, positions=mesh.positions[index], faces=faces, normals=normals, uvs=uvs, colors=colors)
 
 
 def _expand(value: Any, how: str, polygons: Polygons, width: int) -> tuple[NDArray, Polygons] | None:

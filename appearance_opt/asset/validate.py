@@ -9,7 +9,7 @@ import numpy as np
 
 from appearance_opt.asset.alpha import settled
 from appearance_opt.asset.batch import WIDTHS, Batch
-from appearance_opt.asset.normals import unit, vertex_normals, weld
+from appearance_opt.asset.normals import apart, unit, vertex_normals, weld
 from appearance_opt.asset.notes import Notes
 from appearance_opt.asset.rows import count_unique_rows
 from appearance_opt.asset.types import Asset, Mesh
@@ -74,7 +74,7 @@ def validate(asset: Asset) -> Validation:
     used = np.zeros(len(positions), bool)
     used[faces] = True
     # vertices of different meshes stay apart
-    first, place = weld(np.concatenate([positions, batch.mesh_of_vertex[:, None].astype(positions.dtype)], axis=1))
+    first, place = weld(apart(positions, batch.mesh_of_vertex))
     welded = place[faces]
     edges, uses = _counted(np.sort(welded[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1), len(first))
     return Validation(

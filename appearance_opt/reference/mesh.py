@@ -10,7 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 from appearance_opt.asset.alpha import seen_through
-from appearance_opt.asset.normals import split_where_cancelled, summed_normals
+from appearance_opt.asset.batch import Batch, replaced, smoothed
 from appearance_opt.asset.packing import EMISSION
 from appearance_opt.asset.sides import culled, single_sided
 from appearance_opt.asset.tangents import any_tangent, split_and_tangents
@@ -57,12 +57,12 @@ class MeshReference:
     """
 
     def __init__(self, asset: Asset) -> None:
-        materials = list(dict.fromkeys(id(m.material) for m in asset.meshes))
         by_id = {id(m.material): m.material for m in asset.meshes}
-        self.maps = material_maps([by_id[k] for k in materials])
-        self.emission = emission_maps([by_id[k] for k in materials])
-        self.coverage = coverage_maps([by_id[k] for k in materials])
-        self.merged = merge(asset, [materials.index(id(m.material)) for m in asset.meshes], self.maps.has_normal_map)
+        number = {key: k for k, key in enumerate(by_id)}
+        self.maps = material_maps(list(by_id.values()))
+        self.emission = emission_maps(list(by_id.values()))
+        self.coverage = coverage_maps(list(by_id.values()))
+        self.merged = merge(asset, [number[id(m.material)] for m in asset.meshes], self.maps.has_normal_map)
         m = self.merged
         self.single = single_sided(asset.meshes)
         passing = None
@@ -182,42 +182,42 @@ class SurfaceSample:
 def merge(asset: Asset, material_of: list[int], need_tangents: bool) -> MergedMesh:
     """Concatenate the meshes of an asset; computes what a mesh lacks (angle-weighted normals,
     MikkTSpace tangents where a normal map needs them, zero UVs, white vertex colours)."""
-    need_colors = any(m.colors is not None for m in asset.meshes)
-    parts = [_complete(m, need_tangents, need_colors) for m in asset.meshes]
-    start = np.cumsum([0] + [len(p.positions) for p in parts[:-1]])
-
-    def join(name: str) -> NDArray:
-        return np.concatenate([getattr(p, name) for p in parts])
-
+    meshes = smoothed(asset.meshes)
+    if need_tangents:
+        lacking = [m.tangents is None for m in meshes]
+        mapped = [m.material.normal_texture is not None and m.uvs is not None for m in meshes]
+        meshes = replaced(meshes, [a and b for a, b in zip(lacking, mapped, strict=True)], _with_tangents)
+    batch = Batch(meshes)
+    normals = batch.joined("normals")
+    tangents = None
+    if need_tangents:
+        tangents = batch.joined("tangents")
+        free = ~np.any(tangents, axis=1)  # no normal map reads them
+        tangents[free] = np.concatenate([any_tangent(normals[free]), np.ones((int(free.sum()), 1))], axis=1)
     return MergedMesh(
-        positions=join("positions"),
-        normals=join("normals"),
-        uvs=join("uvs"),
-        tangents=join("tangents") if need_tangents else None,
-        colors=join("colors") if need_colors else None,
-        faces=np.concatenate([p.faces + s for p, s in zip(parts, start, strict=True)]).astype(np.int32),
-        material=np.repeat(np.array(material_of, np.int32), [len(p.faces) for p in parts]),
+        positions=batch.joined("positions"),
+        normals=normals,
+        uvs=batch.joined("uvs"),
+        tangents=tangents,
+        colors=_joined_colors(batch),
+        faces=batch.faces.astype(np.int32),
+        material=np.array(material_of, np.int32)[batch.mesh_of_face],
     )
 
 
-def _complete(mesh: Mesh, need_tangents: bool, need_colors: bool) -> MergedMesh:
-    positions, faces = mesh.positions, mesh.faces
-    normals = mesh.normals
-    uvs = np.zeros((len(positions), 2), np.float32) if mesh.uvs is None else mesh.uvs
-    colors = np.ones((len(positions), 4), np.float32)
-    if mesh.colors is not None:
-        # the alpha of opaque modes means nothing
-        width = 3 if mesh.material.alpha_mode == "opaque" else mesh.colors.shape[1]
-        colors[:, :width] = mesh.colors[:, :width]
-    tangents = mesh.tangents
-    if normals is None:
-        index, faces, normals = split_where_cancelled(positions, faces, summed_normals(positions, faces))
-        positions, uvs, colors = positions[index], uvs[index], colors[index]
-        tangents = None
-    if need_tangents and tangents is None:
-        if mesh.material.normal_texture is None or mesh.uvs is None:
-            tangents = np.concatenate([any_tangent(normals), np.ones((len(normals), 1))], axis=1).astype(np.float32)
-        else:
-            index, faces, tangents = split_and_tangents(positions, normals, uvs, faces)
-            positions, normals, uvs, colors = positions[index], normals[index], uvs[index], colors[index]
-    return MergedMesh(positions, normals, uvs, tangents, colors if need_colors else None, faces, np.empty(0, np.int32))
+def _with_tangents(batch: Batch) -> list[Mesh]:
+    positions, normals, uvs = (batch.joined(name) for name in ("positions", "normals", "uvs"))
+    index, faces, tangents = split_and_tangents(positions, normals, uvs, batch.faces, batch.mesh_of_vertex)
+    return batch.reindexed(index, faces, tangents=tangents)
+
+
+def _joined_colors(batch: Batch) -> NDArray[np.float32] | None:
+    """(V, 4) vertex colours, white where a mesh has none; the alpha of opaque modes means nothing."""
+    if not batch.have("colors").any():
+        return None
+    given = batch.joined("colors", 1.0)
+    out = np.ones((len(given), 4), np.float32)
+    out[:, : given.shape[1]] = given
+    opaque = np.array([m.material.alpha_mode == "opaque" for m in batch.meshes], bool)
+    out[opaque[batch.mesh_of_vertex], 3] = 1.0
+    return out

@@ -201,15 +201,28 @@ def build_pyramid(bases: Sequence[NDArray[np.float32]], wraps: Sequence[int], ma
     """Pyramid of several materials from their base levels, each (H, W, channels) float32 linear."""
     channels = bases[0].shape[2]
     layout = pyramid_layout([(b.shape[1], b.shape[0]) for b in bases], channels, wraps, max_levels)
-    parts = []
+    parts: list[mi.Float] = []
+    plain: list[NDArray[np.float32]] = []  # single texels, which have no further levels, in a row
+
+    def upload_plain() -> None:
+        if plain:
+            parts.append(mi.Float(np.concatenate(plain)))
+            plain.clear()
+
     for base, sizes, offsets in zip(bases, layout.sizes, layout.offsets, strict=True):
-        level = mi.Float(np.ascontiguousarray(base, np.float32).ravel())
+        texels = np.ascontiguousarray(base, np.float32).ravel()
+        if len(texels) == channels:
+            plain.append(texels)
+            continue
+        upload_plain()
+        level = mi.Float(texels)
         parts.append(level)
         for size, before, after in zip(sizes, offsets, offsets[1:], strict=False):
             if after == before:
                 break
             level = downsample(level, size, channels)
             parts.append(level)
-    texels = parts[0] if len(parts) == 1 else dr.concat(parts)
-    dr.eval(texels)
-    return Pyramid.of(layout, texels)
+    upload_plain()
+    joined = parts[0] if len(parts) == 1 else dr.concat(parts)
+    dr.eval(joined)
+    return Pyramid.of(layout, joined)
