@@ -14,6 +14,7 @@ from appearance_opt.asset.creases import Edges, shaded, smooth_by_angle, split
 from appearance_opt.asset.normals import unit, vertex_normals
 from appearance_opt.asset.types import Asset, Mesh, srgb_to_linear
 from appearance_opt.baking.low import movable, unwrapped
+from appearance_opt.errors import InputError
 from appearance_opt.initial.decimate import decimate
 from appearance_opt.latent.latent import LatentMesh
 
@@ -279,6 +280,40 @@ def test_colours_of_magics(tmp_path: Path) -> None:
     want = np.array([(1, 0, 0), (0, 1, 0), part, part])
     np.testing.assert_allclose(colors, np.repeat(want[:, None], 3, axis=1), atol=1e-6)
     assert any("alpha" in note for note in asset.notes)
+
+
+def test_binary_stl_files_whose_length_is_not_their_number(tmp_path: Path) -> None:
+    box = trimesh.creation.box()
+    whole, path = soup(box.vertices[box.faces], header=b"solid, but binary"), tmp_path / "x.stl"
+
+    def with_count(count: int) -> bytes:
+        return b"not text".ljust(80) + struct.pack("<I", count) + whole[84:]
+
+    for data, triangles, told in (
+        (whole, 12, None),
+        (with_count(12) + b"\0\0\0", 12, "3 bytes behind its 12 facets"),
+        (with_count(11), 11, "50 bytes behind its 11 facets"),
+        (with_count(0), 12, "all 12 are read"),
+    ):
+        path.write_bytes(data)
+        asset = load(path)
+        assert asset.triangle_count == triangles
+        assert any(told in note for note in asset.notes) if told else len(asset.notes) == 1
+    for data, told in (
+        (with_count(13), "12 of 13 facets"),
+        (with_count(12)[:-1], "11 of 12"),
+        (with_count(0)[:84], "no triangles"),
+    ):
+        path.write_bytes(data)
+        with pytest.raises(InputError, match=f"x.stl: .*{told}"):
+            load(path)
+
+
+def test_text_stl_files_of_several_solids(tmp_path: Path) -> None:
+    one = trimesh.creation.box().export(file_type="stl_ascii")
+    for mark in ("", "\ufeff"):
+        (tmp_path / "x.stl").write_text(mark + one + one.upper().replace("\n", "\r\n"), encoding="utf-8")
+        assert load(tmp_path / "x.stl").triangle_count == 24
 
 
 def test_an_stl_file_without_colours_has_none(tmp_path: Path) -> None:

@@ -20,6 +20,11 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+_HEAD = 84
+"""Bytes before the facets of a binary file: a header without meaning, and their number."""
+
+_FACET = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+
 _OWN = 1 << 15
 """The bit that says what the other fifteen of a facet's attribute mean."""
 
@@ -27,21 +32,19 @@ _OWN = 1 << 15
 def load_stl(path: Path, keep_layout: bool = False) -> Asset:
     """Read an STL file: vertices at one place are one, edges sharp by ``creases.smooth_by_angle`` are
     hard. ``keep_layout``: see ``asset.load``. Raises InputError."""
-    import trimesh
-
     path = Path(path)
     data = read_bytes(path)
     notes = ["no material in this format: a default one is used"]
-    try:
-        loaded = trimesh.load(io.BytesIO(data), file_type="stl", process=False, force="mesh")
-    except Exception as error:  # trimesh's readers raise anything on damaged files
-        raise InputError(f"{path}: not a readable STL file ({type(error).__name__})") from error
-    if not isinstance(loaded, trimesh.Trimesh) or not len(loaded.faces):
+    facets = _facets(data, path, notes.append)
+    if facets is None:
+        corners, colors = _from_text(data, path), None
+    else:
+        corners = facets["corners"].astype(np.float64).reshape(-1, 3)
+        colors = facet_colors(data[:80], facets["attribute"], notes.append)
+    if not len(corners):
         raise InputError(f"{path}: there are no triangles in it")
-    attribute = loaded.face_attributes.get("stl")
-    colors = None if attribute is None else facet_colors(data[:80], np.asarray(attribute), notes.append)
-    first, place = weld(np.asarray(loaded.vertices, np.float64))
-    positions, faces = np.asarray(loaded.vertices, np.float64)[first], place[loaded.faces]
+    first, place = weld(corners)
+    positions, faces = corners[first], place.reshape(-1, 3)
     vertex_colors = None
     if colors is not None:  # a vertex for each colour at a place
         values, kind = np.unique(colors, axis=0, return_inverse=True)
@@ -54,6 +57,40 @@ def load_stl(path: Path, keep_layout: bool = False) -> Asset:
     if not keep_layout:
         meshes = shaded(meshes)
     return Asset(tuple(meshes), path.stem, tuple(notes), origin=origin)
+
+
+def _facets(data: bytes, path: Path, note: Callable[[str], None]) -> NDArray | None:
+    """The facets of a binary file, None for one of text. Raises InputError if it is cut short."""
+    count = int.from_bytes(data[_HEAD - 4 : _HEAD], "little")
+    there, rest = divmod(len(data) - _HEAD, _FACET.itemsize)
+    # binary files may begin like those of text: their length tells
+    if len(data) < _HEAD or (_is_text(data) and (count != there or rest)):
+        return None
+    if count > there:
+        raise InputError(f"{path}: the STL file is cut short, or is none: {there} of {count} facets are there")
+    if count == 0 and there:
+        note(f"its number of facets is 0: all {there} are read")
+        count = there
+    elif count != there or rest:
+        note(f"{len(data) - _HEAD - count * _FACET.itemsize} bytes behind its {count} facets are ignored")
+    return np.frombuffer(data, _FACET, count, _HEAD)
+
+
+def _is_text(data: bytes) -> bool:
+    return data.removeprefix(b"\xef\xbb\xbf").lstrip()[:5].lower() == b"solid"
+
+
+def _from_text(data: bytes, path: Path) -> NDArray[np.float64]:
+    """(3 F, 3) corners of the facets of a file of text."""
+    import trimesh
+
+    try:
+        loaded = trimesh.load(io.BytesIO(data), file_type="stl_ascii", process=False, force="mesh")
+    except Exception as error:  # trimesh's readers raise anything on damaged files
+        raise InputError(f"{path}: not a readable STL file ({type(error).__name__})") from error
+    if not isinstance(loaded, trimesh.Trimesh):
+        return np.empty((0, 3))
+    return np.asarray(loaded.vertices, np.float64)[loaded.faces].reshape(-1, 3)
 
 
 def facet_colors(
