@@ -140,6 +140,34 @@ def test_meshes_of_one_material_are_told_apart() -> None:
     assert [m.material.alpha_mode for m in got.meshes] == ["opaque", "mask"]
 
 
+def test_connected_parts_of_a_mesh_are_told_apart() -> None:
+    """One material is that of a body and of its hair: nothing that hangs together is taken apart."""
+    body = card(LEAF, RIGHT)
+    hair = replace(card(LEAF), positions=SQUARE + np.float32([5, 0, 0]))
+    # a square of one opaque and one cut-out triangle is no place to cut
+    half_uvs = np.concatenate([RIGHT[:3], RIGHT[[0, 2]] - np.float32([0.4, 0]), RIGHT[3:] - np.float32([0.4, 0])])
+    half = replace(
+        card(LEAF), positions=SQUARE[[0, 1, 2, 0, 2, 3]] + np.float32([9, 0, 0]), uvs=half_uvs,
+        faces=np.array([[0, 1, 2], [3, 4, 5]], np.int32), normals=np.tile(np.float32([0, 0, 1]), (6, 1)),
+    )  # fmt: skip
+    parts = (hair, body, half)
+    start = np.cumsum([0] + [len(m.positions) for m in parts[:-1]])
+    joined = replace(
+        body,
+        **{n: np.concatenate([getattr(m, n) for m in parts]) for n in ("positions", "normals", "uvs")},
+        faces=np.concatenate([m.faces + s for m, s in zip(parts, start, strict=True)]).astype(np.int32),
+    )
+    got = repair(Asset((joined,)), "x")
+    assert [(m.name, m.material.alpha_mode) for m in got.meshes] == [("card", "opaque"), ("card", "mask")]
+    for name in ("positions", "uvs", "normals"):
+        np.testing.assert_array_equal(getattr(got.meshes[0], name), getattr(body, name))
+        both = np.concatenate([getattr(hair, name), getattr(half, name)])
+        np.testing.assert_array_equal(getattr(got.meshes[1], name), both)
+    assert got.notes == (
+        "parts of transparent materials that are opaque all over are told apart from the others: 'leaf' (2 triangles)",
+    )
+
+
 def test_many_names_are_counted() -> None:
     got = repair(Asset(tuple(card(replace(PANE, name=f"m{k}", opacity=1.0)) for k in range(9))), "x")
     assert got.notes == (

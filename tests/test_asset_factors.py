@@ -8,13 +8,22 @@ from pathlib import Path
 import pytest
 
 from appearance_opt.asset import load
-from appearance_opt.asset.types import Asset, Material
+from appearance_opt.asset.types import Asset, Material, Volume
 from appearance_opt.asset.validate import repair
 from appearance_opt.errors import InputError
 
 
 @pytest.mark.parametrize(
-    "change", [{"emission": (0.0, float("nan"), 0.0)}, {"opacity": float("inf")}, {"alpha_cutoff": float("nan")}]
+    "change",
+    [
+        {"emission": (0.0, float("nan"), 0.0)},
+        {"opacity": float("inf")},
+        {"alpha_cutoff": float("nan")},
+        {"transmission": float("nan")},
+        {"ior": float("inf")},
+        {"volume": Volume(float("nan"))},
+        {"volume": Volume(0.1, float("nan"))},
+    ],
 )
 def test_factors_that_are_no_numbers_are_refused(ball: Asset, change: dict) -> None:
     bad = replace(ball.meshes[0], material=replace(Material("m"), **change))

@@ -14,6 +14,8 @@ from appearance_opt.asset.alpha import kind_of, seen_through
 from appearance_opt.asset.types import Asset, Material, Mesh, Texture
 from appearance_opt.errors import InputError
 from appearance_opt.jobs import report
+from appearance_opt.jobs.bake import BakeJob
+from appearance_opt.jobs.fitting import Stopwatch
 from appearance_opt.jobs.parts import split
 from appearance_opt.jobs.simplify import _fingerprint
 from appearance_opt.jobs.start import loaded_mesh
@@ -131,6 +133,34 @@ def test_bakes_leave_them_alone(snow_globe: Asset) -> None:
     assert result.maps["occlusion"][result.covered].mean() > 0.99
     assert any(n.startswith("transparent parts of HIGH are not baked: 2 (") for n in result.notes)
     assert any(n.startswith("transparent parts of LOW stay as they are: 1 ('pane')") for n in result.notes)
+
+
+def test_joint_bakes_leave_them_alone(snow_globe: Asset) -> None:
+    low = Asset((ball(1.1, GLASS, "pane", 6), ball(0.52, Material("low", BLUE), "low", 8)), "low")
+    chosen = {k: v for k, v in QUICK.items() if k != "reallocate"}
+    options_ = appearance_opt.bake_options(**{**chosen, "joint": True, "subdivision": (1,)})
+    got = appearance_opt.joint(snow_globe, low, None, options_)
+    for asset in (got.asset, got.start, got.shown):
+        check_kept(asset, low)
+    assert (got.triangles, got.kept_triangles) == (len(low.meshes[1].faces), len(low.meshes[0].faces))
+
+
+def test_what_is_aligned_is_aligned_whole(snow_globe: Asset) -> None:
+    """By what is baked; HIGH's glass, of which a report's pictures show something, goes with it."""
+    away = np.float32([3, -2, 1])
+    moved = replace(
+        snow_globe, meshes=tuple(replace(m, positions=m.positions * np.float32(2) + away) for m in snow_globe.meshes)
+    )
+    low = Asset((ball(0.5, Material("low", BLUE), "low", 16),), "low")
+    parts = split(moved, "HIGH", "bake"), split(low, "LOW", "bake onto")
+    job = BakeJob(*parts, "LOW", appearance_opt.bake_options(align=True, unwrap=True), Stopwatch())
+    for mesh, name in zip(job.high.meshes, ("ball", "shell", "sticker"), strict=True):
+        expected = next(m for m in snow_globe.meshes if m.name == name)
+        np.testing.assert_allclose(mesh.positions, expected.positions, atol=2e-3)
+    sampler, frame = job.view_of_all()
+    assert frame[1] > 1.04  # the label, at 1.05, is in the picture
+    assert job.frame[1] < 0.6
+    assert sampler.hull is not None
 
 
 def test_resuming_knows_what_stays(snow_globe: Asset) -> None:

@@ -10,7 +10,9 @@ from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
 
+from appearance_opt.asset.normals import weld
 from appearance_opt.asset.packing import resized
+from appearance_opt.asset.sides import connected_parts
 from appearance_opt.asset.types import Texture
 
 if TYPE_CHECKING:
@@ -92,25 +94,61 @@ def counted(asset: Asset) -> dict[Kind, Share]:
 
 
 def settled(asset: Asset) -> Asset:
-    """The asset with meshes opaque whose materials speak of transparency, but whose alpha is opaque wherever they lie
-    in their textures; a note names these materials. Costs nothing without such materials."""
+    """The asset with what is opaque all over told apart from what is not, where materials speak of transparency.
+
+    Each connected part of a mesh is one or the other, by the alpha of the texels that its faces reach: one material may
+    be that of a body and of its hair. Opaque parts get an opaque material, and a mesh of their own where their mesh has
+    others; notes name the materials. Costs nothing without such materials.
+    """
     if not any(map(seen_through, asset.meshes)):
         return asset
     tests = _Tests()
-    new: dict[int, Material] = {}
-    meshes = []
+    solid: dict[int, Material] = {}
+    meshes: list[Mesh] = []
+    mixed: dict[str, int] = {}
     for mesh in asset.meshes:
-        if seen_through(mesh) and tests.opaque(mesh):
-            given = mesh.material
-            if id(given) not in new:
-                new[id(given)] = replace(given, alpha_mode="opaque", opacity=1.0, transmission=0.0)
-            mesh = replace(mesh, material=new[id(given)], colors=None if mesh.colors is None else mesh.colors[:, :3])
-        meshes.append(mesh)
-    if not new:
-        return asset
-    names = listed(m.name for m in new.values())
-    note = f"materials that speak of transparency are opaque wherever they are used, and count as that: {names}"
-    return replace(asset, meshes=tuple(meshes), notes=(*asset.notes, note))
+        clear = _parts_with(mesh, ~tests.opaque(mesh)) if seen_through(mesh) else None
+        if clear is None or clear.all():
+            meshes.append(mesh)
+            continue
+        given = mesh.material
+        opaque = solid.setdefault(id(given), replace(given, alpha_mode="opaque", opacity=1.0, transmission=0.0))
+        rest = _only(mesh, ~clear)
+        colors = None if rest.colors is None else rest.colors[:, :3]
+        meshes.append(replace(rest, material=opaque, colors=colors))
+        if clear.any():
+            meshes.append(_only(mesh, clear))
+            mixed[given.name] = mixed.get(given.name, 0) + int((~clear).sum())
+    notes = []
+    whole = [m.name for m in solid.values() if m.name not in mixed]
+    if whole:
+        names = listed(whole)
+        notes.append(
+            f"materials that speak of transparency are opaque wherever they are used, and count as that: {names}"
+        )
+    if mixed:
+        told = f"{listed(mixed)} ({sum(mixed.values())} triangles)"
+        notes.append(f"parts of transparent materials that are opaque all over are told apart from the others: {told}")
+    return replace(asset, meshes=tuple(meshes), notes=(*asset.notes, *notes)) if notes else asset
+
+
+def _parts_with(mesh: Mesh, marked: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """(F,) faces of connected parts that have a marked face."""
+    if marked.all() or not marked.any():
+        return marked
+    first, place = weld(mesh.positions)
+    part = connected_parts(place[mesh.faces].astype(np.int64), len(first))
+    return (np.bincount(part, marked) > 0)[part]
+
+
+def _only(mesh: Mesh, chosen: NDArray[np.bool_]) -> Mesh:
+    """The mesh with some of its faces, and what they use of its vertices."""
+    if chosen.all():
+        return mesh
+    used, index = np.unique(mesh.faces[chosen], return_inverse=True)
+    attributes = ("positions", "normals", "uvs", "tangents", "colors")
+    kept = {a: getattr(mesh, a)[used] for a in attributes if getattr(mesh, a) is not None}
+    return replace(mesh, faces=index.reshape(-1, 3).astype(np.int32), **kept)
 
 
 def listed(names: Iterable[str]) -> str:
@@ -126,24 +164,24 @@ class _Tests:
 
     _sums: dict[tuple[int, float], NDArray[np.int64] | None] = field(default_factory=dict)
 
-    def opaque(self, mesh: Mesh) -> bool:
-        """Is a mesh opaque on all of its faces?"""
-        m = mesh.material
+    def opaque(self, mesh: Mesh) -> NDArray[np.bool_]:
+        """(F,) faces that light does not pass."""
+        m, count = mesh.material, len(mesh.faces)
         if m.transmission > 0:  # a texture that takes it all back is not worth a search
-            return m.transmission_texture is not None and not m.transmission_texture.pixels[..., 0].any()
+            nothing = m.transmission_texture is not None and not m.transmission_texture.pixels[..., 0].any()
+            return np.full(count, nothing)
         needed = m.alpha_cutoff if m.alpha_mode == "mask" else OPAQUE
-        least = m.opacity
-        if mesh.colors is not None and mesh.colors.shape[1] == 4:
-            least *= float(mesh.colors[:, 3].min(initial=1.0))
         if needed <= 0:
-            return True
-        if least < needed:
-            return False
+            return np.ones(count, bool)
+        least = np.full(count, m.opacity)
+        if mesh.colors is not None and mesh.colors.shape[1] == 4:
+            least *= mesh.colors[:, 3][mesh.faces].min(axis=1)
+        enough = least >= needed
         texture = m.base_color_texture
-        if texture is None or texture.pixels.shape[2] < 4:
-            return True
-        sums = self._below(texture, needed / least)
-        return sums is None or bool((_counts(sums, mesh, texture) == 0).all())
+        if texture is None or texture.pixels.shape[2] < 4 or not enough.any():
+            return enough
+        sums = self._below(texture, needed / float(least[enough].min()))
+        return enough if sums is None else enough & (_counts(sums, mesh, texture) == 0)
 
     def _below(self, texture: Texture, needed: float) -> NDArray[np.int64] | None:
         """(H + 1, W + 1) numbers of texels with less alpha than ``needed`` above and left of each corner of the grid;

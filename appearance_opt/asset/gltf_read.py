@@ -135,6 +135,9 @@ class _Reader:
             if self._uses[node["mesh"]] > 1:
                 self._local[key] = local
         place = self.nodes.placement(node, world)
+        inside = local.material.volume
+        if inside is not None and inside.thickness > 0 and not np.allclose(place.volumes(), 1, rtol=1e-3):
+            self.note("the thickness of transmissive materials is not scaled with the nodes of their meshes")
         self.document.companions.budget.take_copies(local, place.copies, self.path)
         return placed(local, place, name)
 

@@ -36,6 +36,10 @@ class Placement:
         """(P V, width) what all copies have alike."""
         return values if values is None or self.skinned or len(self.matrix) == 1 else np.tile(values, (self.copies, 1))
 
+    def volumes(self) -> NDArray[np.float64]:
+        """How many times as large as in its own frame anything is at each place."""
+        return np.abs(np.linalg.det(self.matrix[:, :3, :3]))
+
     def mirrored(self, vertices: int) -> NDArray[np.bool_]:
         """(P V,) is the mapping of a vertex a reflection?"""
         return self._mirrors if self.skinned else np.repeat(self._mirrors, vertices)

@@ -40,15 +40,15 @@ def culled(
         return None
     first, place = weld(np.asarray(positions))
     f = place[np.asarray(faces)].astype(np.int64)
-    part = _parts(f, len(first))
+    part = connected_parts(f, len(first))
     blocking = np.ones(len(f), bool) if passing is None else ~passing
     solid = _solid(np.asarray(positions, np.float64)[first], f[blocking], part[blocking], int(part.max()) + 1)
     out = single & ~(solid[part] & blocking)
     return out if out.any() else None
 
 
-def _parts(faces: NDArray, vertices: int) -> NDArray[np.int32]:
-    """(F,) the connected part that each face belongs to."""
+def connected_parts(faces: NDArray, vertices: int) -> NDArray[np.int32]:
+    """(F,) the connected part that each face of a welded mesh of so many vertices belongs to."""
     ends = faces[:, [0, 1]].ravel(), faces[:, [1, 2]].ravel()
     graph = coo_matrix((np.ones(len(ends[0]), np.int8), ends), (vertices, vertices))
     return connected_components(graph, directed=False)[1][faces[:, 0]]

@@ -213,8 +213,12 @@ def repair_material(material: Material, source: str, notes: Notes) -> Material:
     """The material with factors and float texels within [0, 1], and a note if they were not. Raises
     InputError for factors that are not numbers."""
     factors = (*material.base_color, material.roughness, material.metalness, material.opacity, material.transmission)
-    others = (material.normal_scale, *material.emission, material.alpha_cutoff, material.ior)
-    if not np.isfinite((*factors, *others)).all():
+    others: tuple[float, ...] = (material.normal_scale, *material.emission, material.alpha_cutoff, material.ior)
+    unknown = False
+    if material.volume is not None:
+        others = (*others, material.volume.thickness, *material.volume.attenuation_color)
+        unknown = np.isnan(material.volume.attenuation_distance)  # infinite without attenuation
+    if unknown or not np.isfinite((*factors, *others)).all():
         raise InputError(
             f"{source}, material '{material.name}': a factor is NaN or infinite; set it to a number from 0 to 1"
         )
