@@ -81,8 +81,9 @@ class MaterialReader:
 
     def bound_keys(self, prim: Any) -> tuple[str, ...]:
         """What tells the materials of a mesh and its subsets from those of others."""
-        bound = (self._bound_prim(wearer) for wearer in (prim, *self._subsets(prim)))
-        return tuple(_key(material) if material else "" for material in bound)
+        wearers = (prim, *self._subsets(prim))
+        bound = ((w, self._bound_prim(w)) for w in wearers)
+        return tuple(_key(material) if material else self._unresolved(w) or "" for w, material in bound)
 
     def _subsets(self, prim: Any) -> list[Any]:
         from pxr import UsdShade
