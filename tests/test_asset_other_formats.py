@@ -202,16 +202,6 @@ def test_strips_of_a_ply_file_are_refused_by_name(tmp_path: Path) -> None:
         load(tmp_path / "x.ply")
 
 
-def test_the_picture_of_a_ply_file_is_not_looked_for(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    """trimesh logs a traceback where it does not find it."""
-    header, end, body = trimesh.creation.box().export(file_type="ply").partition(b"element vertex")
-    (tmp_path / "x.ply").write_bytes(header + b"comment TextureFile absent.png\n" + end + body)
-    asset = load(tmp_path / "x.ply")
-    assert len(asset.meshes[0].faces) == 12
-    assert "its texture is ignored" in asset.notes
-    assert not caplog.records
-
-
 def test_catmull_clark_of_a_cube_tends_to_its_known_limit() -> None:
     corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], np.float64)
     quads = [0, 1, 3, 2, 4, 6, 7, 5, 0, 4, 5, 1, 2, 3, 7, 6, 0, 2, 6, 4, 1, 5, 7, 3]

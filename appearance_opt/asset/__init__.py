@@ -79,9 +79,9 @@ def _read(
 
         return load_obj(path, companions, keep_layout)
     if suffix == ".ply":
-        from appearance_opt.asset.geometry import load_geometry
+        from appearance_opt.asset.ply import load_ply
 
-        return load_geometry(path, keep_layout)
+        return load_ply(path, companions, keep_layout)
     if suffix == ".stl":
         from appearance_opt.asset.stl import load_stl
 

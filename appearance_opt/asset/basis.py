@@ -11,6 +11,8 @@ from appearance_opt.errors import InputError
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from appearance_opt.asset.budget import Budget
+
 KTX2 = b"\xabKTX 20\xbb\r\n\x1a\n"
 _BASIS = b"sB\x13\x00"  # the signature, and the version that every file has
 
@@ -20,9 +22,9 @@ def is_basis(data: bytes) -> bool:
     return data.startswith((KTX2, _BASIS))
 
 
-def decode(data: bytes, name: str, largest: int) -> NDArray[np.uint8]:
-    """(H, W, 3) pixels of the finest level, or (H, W, 4) with alpha, row 0 on top, no larger than ``largest``. Raises
-    InputError."""
+def decode(data: bytes, name: str, largest: int, budget: Budget | None = None) -> NDArray[np.uint8]:
+    """(H, W, 3) pixels of the finest level, or (H, W, 4) with alpha, row 0 on top, no larger than ``largest``.
+    ``budget``: what they may take. Raises InputError."""
     try:
         import opengl_basisu
     except ImportError:
@@ -33,6 +35,8 @@ def decode(data: bytes, name: str, largest: int) -> NDArray[np.uint8]:
         if max(texture.width, texture.height) > largest:
             size = f"{texture.width} x {texture.height} pixels"
             raise InputError(f"{name}: {size}; at most {largest} x {largest} are supported")
+        if budget is not None:
+            budget.take_picture(texture.width, texture.height, 4, name)
         pixels = np.asarray(texture.transcode("rgba8").data)
     except opengl_basisu.UnsupportedError as error:
         reason = " ".join(str(error).split())

@@ -55,6 +55,10 @@ class Budget:
         size = width * height * bytes_per_pixel * PICTURE_COPIES
         self._add(size, f"a picture of {width} x {height} pixels", owner)
 
+    def give_back_picture(self, width: int, height: int, bytes_per_pixel: int) -> None:
+        """Count a picture no more: a smaller one stands for it."""
+        self.used -= width * height * bytes_per_pixel * PICTURE_COPIES
+
     def _add(self, size: int, what: str, owner: object) -> None:
         total = self.used + size
         if total > self.limit:

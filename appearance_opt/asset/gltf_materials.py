@@ -244,7 +244,7 @@ class MaterialReader:
         if pixels is None:
             return None
         read = Texture(images.colored(pixels), space, wrap)  # type: ignore[arg-type]
-        return read if name is None or self._tile is None else udim.fitted(read, self._tile, self.note)
+        return read if name is None or self._tile is None else udim.fitted(read, self._tile, self.document.companions)
 
     def _read_tile(self, name: str) -> NDArray | None:
         companions = self.document.companions

@@ -31,7 +31,7 @@ def decode(data: bytes, name: str, budget: Budget | None = None) -> NDArray:
     if not data:
         raise InputError(f"{name}: the image is empty")
     if basis.is_basis(data):
-        return basis.decode(data, name, MAX_SIZE)
+        return basis.decode(data, name, MAX_SIZE, budget)
     # the Python bindings of OpenImageIO read from and write to named files only, and the name chooses the reader:
     # one of ours, by what the data is, for a name may ask for readers that read no picture at all
     suffix = _suffix(data, name)

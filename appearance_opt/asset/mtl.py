@@ -200,7 +200,7 @@ class _Statements:
         texture = Texture(np.ascontiguousarray(pixels), space, (given.wrap, given.wrap))
         if self.tile is None or not udim.is_tiled(given.file):
             return texture
-        return udim.fitted(texture, self.tile, self.companions.note)
+        return udim.fitted(texture, self.tile, self.companions)
 
     def _pixels(self, file: str) -> NDArray | None:
         """None if the file is missing and that is to be ignored, or if it is one in tiles and none is asked for."""

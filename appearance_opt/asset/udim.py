@@ -89,7 +89,7 @@ def _any_tile(name: str, owner: Path) -> bool:
     return any(re.fullmatch(pattern, n) for n in names)
 
 
-def fitted(texture: Texture, tile: Tile, note: Callable[[str], None]) -> Texture:
+def fitted(texture: Texture, tile: Tile, companions: Companions) -> Texture:
     """A tile's texture at a half, a third ... of its size, as means of linear values, so that it has no more texels
     than it may; it ends at its edge. ``note`` is told."""
     texture = replace(texture, wrap=("clamp", "clamp"))
@@ -98,8 +98,13 @@ def fitted(texture: Texture, tile: Tile, note: Callable[[str], None]) -> Texture
     step = min(step, height, width)
     if step == 1:
         return texture
-    note(f"tiles of textures of {width} x {height} texels are read at 1/{step} of their size: there are many")
+    companions.note(
+        f"tiles of textures of {width} x {height} texels are read at 1/{step} of their size: there are many"
+    )
+    bytes_per_texel = channels * texture.pixels.dtype.itemsize
     rows, columns = height // step, width // step
+    companions.budget.give_back_picture(width, height, bytes_per_texel)
+    companions.budget.take_picture(columns, rows, bytes_per_texel, "tiles")
     blocks = texture.linear()[: rows * step, : columns * step].reshape(rows, step, columns, step, channels)
     means = blocks.mean(axis=(1, 3), dtype=np.float32)
     if texture.pixels.dtype.kind == "f":

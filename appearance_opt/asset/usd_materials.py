@@ -207,7 +207,7 @@ class MaterialReader:
     def _fitted(self, texture: Texture, text: str) -> Texture:
         if self._tile is None or not udim.is_tiled(text):
             return texture
-        return udim.fitted(texture, self._tile, self.note)
+        return udim.fitted(texture, self._tile, self.companions)
 
     def _read(self, material: Any) -> Material:
         name = str(material.GetPrim().GetName())
