@@ -340,9 +340,16 @@ def _levels(value: Any) -> tuple[int, ...]:
     """Tessellation levels of 3, "1,2,3" or a list."""
     parts = value.split(",") if isinstance(value, str) else value if isinstance(value, (list, tuple)) else [value]
     try:
-        return tuple(dict.fromkeys(int(p) for p in parts))
-    except (TypeError, ValueError):
+        return tuple(dict.fromkeys(_whole(p) for p in parts))
+    except (TypeError, ValueError, OverflowError):
         raise InputError(f"--subdivision {value}: write one level or several, such as 3 or 1,2,3") from None
+
+
+def _whole(value: Any) -> int:
+    number = int(value)
+    if isinstance(value, bool) or (isinstance(value, float) and number != value):
+        raise ValueError
+    return number
 
 
 def _require(ok: bool, name: str, value: Any, expected: str) -> None:
@@ -360,4 +367,4 @@ def _choice(name: str, value: str, allowed: tuple[str, ...]) -> None:
 def _unknown(name: str, known: frozenset[str]) -> str:
     close = difflib.get_close_matches(name.replace("-", "_"), sorted(known), 1, 0.4)
     hint = f"; did you mean '{close[0].replace('_', '-')}'?" if close else ""
-    return f"unknown key '{name}'{hint}"
+    return f"unknown key '{name[:60]}'{hint}"

@@ -16,7 +16,7 @@ import pytest
 
 from appearance_opt.asset import gltf_read, images, load, usd_guard
 from appearance_opt.asset.door import reading
-from appearance_opt.config import read_toml
+from appearance_opt.config import read_toml, simplify_options
 from appearance_opt.errors import InputError, one_line
 from appearance_opt.evaluate.report import ReportData, page
 
@@ -170,3 +170,35 @@ def test_layers_that_never_end_are_refused(tmp_path: Path, monkeypatch: pytest.M
     monkeypatch.setattr(usd_guard, "PATIENCE", 5.0)
     with pytest.raises(InputError, match="waits for ever"):
         load(path)
+
+
+def test_pictures_whose_damage_is_no_text_are_refused(tmp_path: Path) -> None:
+    """OpenImageIO quotes the file's bytes in what it says, as if they were UTF-8."""
+    data = bytearray(images.encode_exr(np.zeros((4, 4, 3), np.float32)))
+    at = data.index(b"channels\0chlist")
+    data[at : at + 8] = b"\xff" * 8
+    with pytest.raises(InputError, match=r"picture: (not a readable image|the image is damaged)"):
+        images.decode(bytes(data), "picture")
+
+
+def test_errors_quote_no_more_than_a_line_of_a_file(tmp_path: Path) -> None:
+    path = tmp_path / "job.toml"
+    path.write_text("a" * 5000 + " = 1")
+    with pytest.raises(InputError) as caught:
+        read_toml(path)
+    assert len(str(caught.value)) < 500
+
+
+def test_mistakes_in_usd_text_are_placed_in_the_file(tmp_path: Path) -> None:
+    path = tmp_path / "x.usda"
+    path.write_text(LAYER.replace("{\n}", "{\n    int[] a = [1, 2\n}"))
+    with pytest.raises(InputError) as caught:
+        load(path)
+    assert "x.usda:8:1: parse error" in str(caught.value)
+    assert "pxrInternal" not in str(caught.value)
+
+
+@pytest.mark.parametrize("level", [1.9, True, "1.9", [2, 1.5], float("inf")])
+def test_levels_of_tessellation_are_whole(level: object) -> None:
+    with pytest.raises(InputError, match="--subdivision"):
+        simplify_options(triangles=10, displacement=True, subdivision=level)

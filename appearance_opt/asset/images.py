@@ -15,7 +15,7 @@ from appearance_opt.asset.paths import read_bytes
 from appearance_opt.errors import InputError
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Callable, Mapping
 
     from numpy.typing import NDArray
 
@@ -82,7 +82,7 @@ def _open(path: Path, name: str, budget: Budget | None) -> NDArray:
     config.attribute("oiio:UnassociatedAlpha", 1)
     source = oiio.ImageInput.open(str(path), config)
     if source is None:
-        raise InputError(f"{name}: not a readable image ({_one_line(oiio.geterror()) or 'unknown format'})")
+        raise InputError(f"{name}: not a readable image ({_reason(oiio.geterror, 'unknown format')})")
     try:
         return _read(source, name, budget)
     finally:
@@ -102,7 +102,7 @@ def _read(source, name: str, budget: Budget | None) -> NDArray:
         budget.take_picture(spec.width, spec.height, channels * size, name)
     pixels = source.read_image(0, 0, 0, channels, kind)
     if pixels is None:
-        raise InputError(f"{name}: the image is damaged ({_one_line(source.geterror()) or 'cannot be decoded'})")
+        raise InputError(f"{name}: the image is damaged ({_reason(source.geterror, 'cannot be decoded')})")
     pixels = pixels.reshape(spec.height, spec.width, channels)
     if pixels.dtype == np.float32 and not np.isfinite(pixels).all():
         raise InputError(f"{name}: the image has NaN or infinite pixels")
@@ -170,5 +170,10 @@ def _suffix(data: bytes, name: str) -> str:
 _TGA_TYPES = (1, 2, 3, 9, 10, 11)
 
 
-def _one_line(text: str) -> str:
-    return " ".join(text.split())
+def _reason(said: Callable[[], str], otherwise: str) -> str:
+    """What OpenImageIO says of a fault, on one line; ``otherwise`` if it says nothing, or bytes that are no text: it
+    quotes what stands in the file."""
+    try:
+        return " ".join(said().split()) or otherwise
+    except UnicodeDecodeError:
+        return otherwise

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -62,7 +63,9 @@ def load_usd(
     try:
         asset = _read_stage(path, refine, variants or {}, companions or Companions(), keep_layout)
     except Tf.ErrorException as error:
-        raise InputError(f"{path}: not a readable USD file ({_text(error.__str__)})") from None
+        # the first of what went wrong: the place in the file, if it is text
+        said = [_text(partial(getattr, one, "commentary")) for one in error.args if hasattr(one, "commentary")]
+        raise InputError(f"{path}: not a readable USD file ({(said or [_text(error.__str__)])[0]})") from None
     finally:
         warned = [_text(partial(getattr, w, "commentary")) for w in diagnostics.TakeUncoalescedDiagnostics()]
     return replace(asset, notes=asset.notes + tuple(f"USD: {text}" for text in dict.fromkeys(warned)))
@@ -453,8 +456,8 @@ def _expand(value: Any, how: str, polygons: Polygons, width: int) -> tuple[NDArr
 
 
 def _text(get: Callable[[], str]) -> str:
-    """What USD says, in one line. It may quote bytes that are no text."""
+    """What USD says, in one line, without the names of its own functions. It may quote bytes that are no text."""
     try:
-        return " ".join(get().split())[:160]
+        return re.sub(r"pxrInternal\w*::(?:\w+::)*", "", " ".join(get().split()))[:200]
     except UnicodeDecodeError:
         return "it is not text"
