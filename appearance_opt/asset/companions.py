@@ -9,6 +9,7 @@ from urllib.parse import unquote
 
 from appearance_opt.asset import images
 from appearance_opt.asset.budget import Budget
+from appearance_opt.asset.door import DATA_FAULTS
 from appearance_opt.asset.notes import Notes
 from appearance_opt.asset.paths import read_bytes, resolve
 from appearance_opt.errors import InputError, MissingFileError
@@ -87,12 +88,15 @@ class Companions:
         return images.decode(data, name, self.budget)
 
     def read(self, file: Callable[[], T], instead: str = "the material's constants stand alone") -> T | None:
-        """What ``file`` reads; None if it is missing and that is to be ignored. ``instead``: what the note says
-        becomes of it. Raises InputError."""
+        """What ``file`` reads; None if it is missing, or of no use for any other reason, and that is to be ignored.
+        ``instead``: what the note says becomes of it. Raises InputError."""
         try:
             return file()
-        except MissingFileError as error:
+        except (InputError, *DATA_FAULTS) as error:
             if self.policy == "error":
-                raise InputError(f"{error}; add the file, or go on without it: --missing-textures ignore") from None
+                if not isinstance(error, InputError):
+                    raise
+                mend = "add the file, or" if isinstance(error, MissingFileError) else "or"
+                raise InputError(f"{error}; {mend} go on without it: --missing-textures ignore") from None
             self.note(f"{error}: ignored, {instead}", f"files ignored, {instead}")
             return None

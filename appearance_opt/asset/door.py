@@ -11,6 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from appearance_opt.asset.paths import without_stray_bytes
 from appearance_opt.errors import InputError, one_line
 
 if TYPE_CHECKING:
@@ -75,8 +76,10 @@ def with_text_names(asset: Asset) -> Asset:
         name, material = _text(mesh.name), renamed[id(mesh.material)]
         same = name == mesh.name and material is mesh.material
         meshes.append(mesh if same else replace(mesh, name=name, material=material))
-    return replace(asset, meshes=tuple(meshes), notes=tuple(one_line(note) for note in asset.notes))
+    return replace(
+        asset, meshes=tuple(meshes), notes=tuple(one_line(without_stray_bytes(note)) for note in asset.notes)
+    )
 
 
 def _text(name: object) -> str:
-    return str(name).encode("utf-8", "replace").decode("utf-8")
+    return without_stray_bytes(str(name)).encode("utf-8", "replace").decode("utf-8")

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import base64
-import binascii
+import codecs
 import json
 import struct
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from urllib.parse import unquote
 
 import numpy as np
 
@@ -37,7 +38,7 @@ class Document:
         data = read_bytes(self.path)
         text, self._binary = _chunks(data, self.path) if data[:4] == b"glTF" else (data, None)
         try:
-            self.json: dict[str, Any] = json.loads(text)
+            self.json: dict[str, Any] = json.loads(_decoded(text))
         except (ValueError, RecursionError) as error:
             raise InputError(f"{path}: not a glTF file, or cut short ({error})") from None
         if not isinstance(self.json, dict) or not isinstance(self.json.get("asset"), dict):
@@ -62,8 +63,10 @@ class Document:
         """Bytes behind a data URI or a path relative to the file."""
         if uri.startswith("data:"):
             try:
-                return base64.b64decode(uri.split(",", 1)[1], validate=True)
-            except (IndexError, binascii.Error):
+                text = "".join(unquote(uri.split(",", 1)[1]).split()).rstrip("=")
+                # some writers break lines, and leave out what fills up the last group
+                return base64.b64decode(text + "=" * (-len(text) % 4), validate=True)
+            except (IndexError, ValueError):
                 raise InputError(f"{self.path}: a data URI is damaged") from None
         return read_bytes(self.companions.find(uri, self.path, percent_encoded=True))
 
@@ -162,7 +165,9 @@ def _chunks(data: bytes, path: Path) -> tuple[bytes, bytes | None]:
     """(JSON, binary chunk) of a GLB file."""
     if len(data) < 20:
         raise InputError(f"{path}: the GLB file is cut short ({len(data)} bytes)")
-    _, _, length = struct.unpack_from("<III", data)
+    _, version, length = struct.unpack_from("<III", data)
+    if version != 2:
+        raise InputError(f"{path}: GLB version {version} is not supported; convert it to glTF 2.0")
     if length > len(data):
         raise InputError(f"{path}: the GLB file is cut short ({len(data)} of {length} bytes)")
     text, binary, offset = None, None, 12
@@ -178,4 +183,10 @@ def _chunks(data: bytes, path: Path) -> tuple[bytes, bytes | None]:
         offset += 8 + size
     if text is None:
         raise InputError(f"{path}: the GLB file has no JSON chunk")
+    text = text.rstrip(b"\0")  # the specification pads with spaces
     return text, binary
+
+
+def _decoded(text: bytes) -> str:
+    """JSON as text. Names in it that are no UTF-8, which JSON asks for, keep their bytes (see ``paths.resolve``)."""
+    return text.removeprefix(codecs.BOM_UTF8).decode("utf-8", "surrogateescape")

@@ -229,15 +229,16 @@ class MaterialReader:
         if info is None:
             return None
         texture = self.document.items("textures")[info["index"]]
-        source = _source(texture)
-        if source is None:
-            raise InputError(f"{self.path}: a texture of material '{material}' has no image in a supported format")
+        source, companions = _source(texture), self.document.companions
         name = self._tiled_name(info)
-        if name is not None:
+        if source is None:
+            where = f"{self.path}: a texture of material '{material}'"
+            pixels = companions.read(partial(_refuse, f"{where} has no image in a supported format"))
+        elif name is not None:
             pixels = self._read_tile(name)
         else:
             if source not in self._images:
-                self._images[source] = self.document.companions.read(lambda: self._image(source, material))
+                self._images[source] = companions.read(partial(self._image, source, material))
             pixels = self._images[source]
         sampler = self.document.items("samplers")[texture["sampler"]] if "sampler" in texture else {}
         wrap = (_WRAPS.get(sampler.get("wrapS", 0), "repeat"), _WRAPS.get(sampler.get("wrapT", 0), "repeat"))
@@ -263,6 +264,10 @@ class MaterialReader:
         return self.document.companions.decoded(
             data, f"{self.path}, image {image.get('name') or index} of material '{material}'"
         )
+
+
+def _refuse(reason: str) -> NDArray:
+    raise InputError(reason)
 
 
 def _source(texture: dict[str, Any]) -> int | None:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from appearance_opt.asset.materialx_nodes import Input
-from appearance_opt.asset.paths import read_text
+from appearance_opt.asset.paths import read_text, without_stray_bytes
 from appearance_opt.asset.types import srgb_to_linear
 from appearance_opt.errors import InputError
 
@@ -56,13 +56,15 @@ def _read(path: Path, companions: Companions) -> Any:
             raise InputError(f"{path}: its documents include each other in circles")
         found = companions.find(file.asString(), path)
         options.readXIncludeFunction = partial(include, depth=depth + 1)
-        mx.readFromXmlString(into, read_text(found), mx.FileSearchPath(str(found.parent)), options)
+        mx.readFromXmlString(into, without_stray_bytes(read_text(found)), mx.FileSearchPath(str(found.parent)), options)
 
     document = mx.createDocument()
     options = mx.XmlReadOptions()
     options.readXIncludeFunction = partial(include, depth=1)
     try:
-        mx.readFromXmlString(document, read_text(path), mx.FileSearchPath(str(path.parent)), options)
+        mx.readFromXmlString(
+            document, without_stray_bytes(read_text(path)), mx.FileSearchPath(str(path.parent)), options
+        )
         document.flattenSubgraphs()  # nodes that the document itself makes of others
     except (mx.Exception, mx.ExceptionParseError, RuntimeError) as error:
         raise InputError(f"{path}: not a readable MaterialX file ({' '.join(str(error).split())[:160]})") from None

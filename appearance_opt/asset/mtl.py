@@ -13,7 +13,7 @@ from appearance_opt.asset import images, udim, uv_frames
 from appearance_opt.asset.packing import pack_orm, with_alpha
 from appearance_opt.asset.paths import read_text
 from appearance_opt.asset.types import Material, Texture, Wrap
-from appearance_opt.errors import InputError
+from appearance_opt.errors import InputError, MissingFileError
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -36,6 +36,8 @@ _OPTIONAL = ("-o", "-s", "-t")
 """Options whose second and third values may be left out (MTL specification, "Options for texture map statements")."""
 
 _NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?")
+
+_COMMENT = re.compile(r"\s#")
 
 _NORMAL, _BUMP = ("norm", "map_kn"), ("map_bump", "bump")
 _USED = ("map_kd", "map_pr", "map_pm", "map_ke", "map_ka", "map_d", "map_aat", *_NORMAL, *_BUMP)
@@ -206,7 +208,15 @@ class _Statements:
         """None if the file is missing and that is to be ignored, or if it is one in tiles and none is asked for."""
 
         def read(name: str) -> NDArray:
-            return self.companions.picture(self.companions.find(name, self.path))
+            try:
+                found = self.companions.find(name, self.path)
+            except MissingFileError:
+                # what is behind a # may belong to the name, or be a comment
+                plain = _COMMENT.split(name)[0].strip()
+                if not plain or plain == name:
+                    raise
+                found = self.companions.find(plain, self.path)
+            return self.companions.picture(found)
 
         if not udim.is_tiled(file):
             return self.companions.read(lambda: read(file))

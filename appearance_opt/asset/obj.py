@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -29,7 +30,7 @@ MAX_INDEX = 2**31 - 1
 def load_obj(path: Path, companions: Companions, keep_layout: bool = False) -> Asset:
     """Read an OBJ file and its materials. ``keep_layout``: see ``asset.load``. Raises InputError."""
     path = Path(path)
-    text = read_text(path).replace("\\\n", " ")
+    text = re.sub(r"\\\r?\n", " ", read_text(path))
     parser = _Parser(path, companions)
     for number, line in enumerate(text.splitlines(), 1):
         try:
@@ -69,7 +70,8 @@ class _Parser:
         elif key == "f":
             corners = [self._corner(w) for w in words[1:]]
             if len(corners) < 3:
-                raise ValueError
+                self.companions.note("faces with fewer than three corners ignored")
+                return
             has_uv, has_normal = (all(c[k] >= 0 for c in corners) for k in (1, 2))
             key_of = (self.current, has_uv, has_normal)
             self.polygons.setdefault(key_of, []).append(corners)
@@ -79,9 +81,11 @@ class _Parser:
         elif key == "usemtl":
             self.current = line[line.index(key) + len(key) :].strip()
         elif key == "mtllib":
-            name = line.split(None, 1)[1].strip()
-            for path in self._libraries(name):
-                self.materials.read(path)
+            self._read_libraries(line.split(None, 1)[1].strip())
+        elif key in ("l", "p"):
+            self.companions.note("points and lines ignored")
+        elif key in ("curv", "curv2", "surf"):
+            self.companions.note("curves and surfaces of free form ignored")
 
     def _smooth(self, name: str) -> None:
         """Faces that follow are of this smoothing group, of none by "off" and "0"."""
@@ -89,20 +93,20 @@ class _Parser:
         off = name.lower() == "off" or not name.strip("0")
         self.group = 0 if off else self.group_numbers.setdefault(name, len(self.group_numbers) + 1)
 
-    def _libraries(self, names: str) -> list[Path]:
-        """Files of one name, which may have spaces, or of several with spaces between them."""
+    def _read_libraries(self, names: str) -> None:
+        """Read files of one name, which may have spaces, or of several with spaces between them."""
         several = names.split()
         if len(several) > 1:
             try:
-                return [self.companions.find(names, self.path)]
+                return self.materials.read(self.companions.find(names, self.path))
             except MissingFileError:
                 pass
-        out = []
         for name in several:
-            find = partial(self.companions.find, name, self.path)
-            path = self.companions.read(find, "default materials stand for its own")
-            out += [] if path is None else [path]
-        return out
+            read = partial(self._read_library, name)
+            self.companions.read(read, "default materials stand for its own")
+
+    def _read_library(self, name: str) -> None:
+        self.materials.read(self.companions.find(name, self.path))
 
     def _corner(self, word: str) -> tuple[int, int, int]:
         parts = word.split("/")

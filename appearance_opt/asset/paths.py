@@ -14,14 +14,14 @@ from urllib.parse import unquote, urlparse
 from appearance_opt.errors import InputError, MissingFileError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterable, Iterator
 
 
 def resolve(reference: str, owner: Path, percent_encoded: bool = False, root: Path | None = None) -> Path:
     """Path of a file that ``owner`` refers to, or of the only one whose name differs from that in upper and lower case:
     many writers work where that makes no difference. Raises InputError when it lies neither in owner's folder nor in
     ``root`` (an asset must not read what it does not own), MissingFileError when it does not exist."""
-    text = unquote(reference) if percent_encoded else reference
+    text = unquote(reference, errors="surrogateescape") if percent_encoded else reference
     if "\0" in text or (urlparse(text).scheme and len(urlparse(text).scheme) > 1):
         raise InputError(f"{owner}: refers to '{reference}', which is not a file beside it")
     folder = owner.resolve().parent
@@ -34,6 +34,8 @@ def resolve(reference: str, owner: Path, percent_encoded: bool = False, root: Pa
     if exists:
         return path
     found = differing_in_case(path)
+    if found is None and (plain := without_stray_bytes(text)) != text:
+        return resolve(plain, owner, root=root)
     if found is None:
         raise MissingFileError(f"{owner}: refers to '{reference}', which does not exist")
     check_inside(found, owner, reference, root)
@@ -45,9 +47,19 @@ def check_inside(path: Path, owner: Path, reference: str, root: Path | None = No
     allowed = [owner.resolve().parent, *([] if root is None else [root.resolve()])]
     if not any(path.resolve().is_relative_to(folder) for folder in allowed):
         raise InputError(
-            f"{owner}: refers to '{reference}' outside its own folder; copy it beside the file, or allow the folder "
-            "with --root"
+            f"{owner}: refers to '{reference}' outside its own folder; copy it beside the file, or allow the folder: "
+            f"--root {common_folder([path.resolve().parent, *([] if root is None else [root.resolve()])])}"
         )
+
+
+def common_folder(folders: Iterable[Path]) -> Path:
+    """The folder that all of these lie in."""
+    return Path(os.path.commonpath([str(f) for f in folders]))
+
+
+def without_stray_bytes(text: str) -> str:
+    """Text with bytes that were no UTF-8, kept as ``os.fsdecode`` keeps them, taken for Latin-1."""
+    return re.sub("[\udc80-\udcff]", lambda m: chr(ord(m[0]) - 0xDC00), text)
 
 
 def differing_in_case(path: Path) -> Path | None:
@@ -70,14 +82,15 @@ def _listed(folder: Path) -> list[Path]:
 
 def read_text(path: Path, encoding: str = "utf-8") -> str:
     """Text of a file, without its byte order mark, which also says how it is encoded: UTF-8 or UTF-16. Bytes that are
-    no text in that become U+FFFD. Raises InputError when it cannot be read or is empty."""
+    no UTF-8 stay what they are, as ``os.fsdecode`` keeps those of names. Raises InputError when it cannot be read or is
+    empty."""
     data = read_bytes(path)
     marks = ((codecs.BOM_UTF8, "utf-8"), (codecs.BOM_UTF16_LE, "utf-16-le"), (codecs.BOM_UTF16_BE, "utf-16-be"))
     for mark, marked in marks:
         if data.startswith(mark):
             data, encoding = data[len(mark) :], marked
             break
-    return data.decode(encoding, errors="replace")
+    return data.decode(encoding, errors="surrogateescape" if encoding == "utf-8" else "replace")
 
 
 def read_bytes(path: Path) -> bytes:

@@ -17,7 +17,7 @@ from urllib.parse import unquote
 import numpy as np
 
 from appearance_opt.asset.types import Texture, linear_to_srgb
-from appearance_opt.errors import MissingFileError
+from appearance_opt.errors import InputError, MissingFileError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, MutableMapping, Sequence
@@ -73,6 +73,8 @@ def read_tile(
         if not found and not _any_tile(name, owner):
             missing = MissingFileError(f"{owner}: refers to '{name}', of which there is no tile")
             return companions.read(partial(_raise, missing))
+    except InputError as error:
+        return companions.read(partial(_raise, error))
     companions.note(f"'{file}' does not exist: the material's constants stand alone there")
     return None
 

@@ -180,7 +180,11 @@ class MaterialReader:
             for dependency in layer.GetCompositionAssetDependencies():
                 if not dependency.endswith(".mtlx") or not layer.realPath:
                     continue
-                file = self.companions.find(str(Path(layer.realPath).resolve().parent / dependency), self.path)
+                where = str(Path(layer.realPath).resolve().parent / dependency)
+                instead = "default materials stand for its own"
+                file = self.companions.read(partial(self.companions.find, where, self.path), instead)
+                if file is None:
+                    continue
                 surface = find_surface(file, name, self.companions, partial(self._read_beside, file), self._fitted)
                 found = None if surface is None else read_surface(surface, name, self.note)
                 if found is not None:

@@ -16,7 +16,7 @@ from appearance_opt.asset.batch import smoothed
 from appearance_opt.asset.companions import Companions
 from appearance_opt.asset.normals import accumulate, unit
 from appearance_opt.asset.origin import settle
-from appearance_opt.asset.paths import check_inside, read_bytes
+from appearance_opt.asset.paths import check_inside, common_folder, read_bytes
 from appearance_opt.asset.placement import Placement, placed
 from appearance_opt.asset.polygons import Polygons, triangulate
 from appearance_opt.asset.rows import ranked, unique_rows
@@ -96,11 +96,30 @@ def _select(stage: Any, variants: dict[str, str], path: Path) -> None:
 
 
 def _refuse_escapes(stage: Any, path: Path, companions: Companions) -> None:
-    """Layers outside the folder of the root layer, or the one that is allowed, are not read on behalf of it."""
+    """Layers outside the folder of the root layer, or the one that is allowed, are not read on behalf of it. Raises
+    InputError, which names the folder to allow for all that the asset refers to."""
     for layer in stage.GetUsedLayers():
         if layer.anonymous or not layer.realPath:
             continue
-        check_inside(Path(layer.realPath.split("[")[0]), path, layer.identifier, companions.root)
+        try:
+            check_inside(Path(layer.realPath.split("[")[0]), path, layer.identifier, companions.root)
+        except InputError:
+            raise InputError(
+                f"{path}: refers to '{layer.identifier}' and files in other folders than its own; allow the folder: "
+                f"--root {_folder_of_all(stage, path, companions.root)}"
+            ) from None
+
+
+def _folder_of_all(stage: Any, path: Path, root: Path | None) -> Path:
+    """The folder that holds the layers and files of a stage that lie outside of its own folder."""
+    from pxr import UsdUtils
+
+    layers, files, _ = UsdUtils.ComputeAllDependencies(stage.GetRootLayer().identifier)
+    names = [*(layer.realPath for layer in layers), *files, *(layer.realPath for layer in stage.GetUsedLayers())]
+    folders = {Path(name.split("[")[0]).resolve().parent for name in names if name}
+    own = path.resolve().parent
+    outside = [folder for folder in folders if not folder.is_relative_to(own)]
+    return common_folder([*outside, *([] if root is None else [root.resolve()])])
 
 
 def _metres_per_unit(stage: Any) -> float:
@@ -195,11 +214,14 @@ class _Reader:
         from pxr import UsdGeom
 
         imageable = UsdGeom.Imageable(prim)
-        hidden = imageable.ComputeVisibility(self.time) == UsdGeom.Tokens.invisible
-        if hidden or imageable.ComputePurpose() in (UsdGeom.Tokens.guide, UsdGeom.Tokens.proxy):
-            self.note(f"'{prim.GetPath()}' ignored: hidden, guide or proxy geometry")
-            return False
-        return True
+        purpose = str(imageable.ComputePurpose())
+        if imageable.ComputeVisibility(self.time) == UsdGeom.Tokens.invisible:
+            self.note(f"'{prim.GetPath()}': hidden, ignored")
+        elif purpose in (UsdGeom.Tokens.guide, UsdGeom.Tokens.proxy):
+            self.note(f"'{prim.GetPath()}': of purpose {purpose}, ignored")
+        else:
+            return True
+        return False
 
     def _instances(self, prim: Any) -> list[Mesh]:
         """The meshes of a PointInstancer's prototypes, each where an instance is."""
@@ -224,7 +246,7 @@ class _Reader:
             back = self.cache.GetLocalToWorldTransform(root).GetInverse()
             for part in Usd.PrimRange(root, Usd.TraverseInstanceProxies()):
                 if part.IsA(UsdGeom.PointInstancer):
-                    self.note(f"'{part.GetPath()}' ignored: it is a prototype of another PointInstancer")
+                    self.note(f"'{part.GetPath()}': ignored, it is a prototype of another PointInstancer")
                 if not part.IsA(UsdGeom.Gprim) or not self._shown(part):
                     continue
                 local = np.array(self._to_world(part) * back)
@@ -271,7 +293,7 @@ class _Reader:
             return _Geometry(*self._mesh(prim, flipped), flipped, np.array(holes or [], np.int64))
         found = usd_shapes.triangles(prim, self.time)
         if found is None:
-            self.note(f"{prim.GetTypeName()} '{prim.GetPath()}' ignored: only surfaces are read")
+            self.note(f"{prim.GetTypeName()} '{prim.GetPath()}': ignored, only meshes and plain shapes are read")
             return None
         positions, normals, faces = found
         polygons = Polygons(np.full(len(faces), 3), faces.ravel())
@@ -296,6 +318,8 @@ class _Reader:
         refined = 4**self.refine if str(mesh.GetSubdivisionSchemeAttr().Get()) in _REFINED else 1
         self.companions.budget.take(len(points) * refined, "vertices", self.path)
         self.companions.budget.take(len(indices) * refined, "faces", self.path)
+        if (counts < 3).any():
+            self.note(f"'{prim.GetPath()}': faces with fewer than three corners ignored")
         polygons = Polygons(counts, indices)
         face_ids = np.arange(len(counts))
         values = {"points": (points, polygons)}

@@ -29,6 +29,12 @@ could address a texel."""
 LIMITS: dict[str, tuple[float, float]] = {"uvs": (-MAX_UV, MAX_UV), "colors": (0.0, 1.0)}
 """Least and greatest values of attributes that mean something."""
 
+REASONS = 5
+"""Notes that an error repeats."""
+
+FILLED: dict[str, tuple[float, str]] = {"uvs": (0.0, "texture coordinates"), "colors": (1.0, "vertex colours")}
+"""What stands for numbers that are none, and how notes call the attributes."""
+
 BAND = 1 << 18
 """Faces looked at at once: more take no less time, and memory."""
 
@@ -123,7 +129,8 @@ def repair(asset: Asset, source: str) -> Asset:
     meshes = [_repair(mesh, source, notes) if suspect else mesh for mesh, suspect in found]
     meshes = [m for m in meshes if len(m.faces)]
     if not meshes:
-        raise InputError(f"{source}: there are no triangles in it")
+        reasons = "; ".join((*asset.notes, *notes.lines())[:REASONS])
+        raise InputError(f"{source}: there are no triangles in it{reasons and f' ({reasons})'}")
     # meshes that shared a material go on sharing it
     materials = {id(m.material): m.material for m in meshes}
     mended = {key: repair_material(m, source, notes) for key, m in materials.items()}
@@ -184,10 +191,16 @@ def _repair(mesh: Mesh, source: str, notes: Notes) -> Mesh:
     broken = int((~np.isfinite(mesh.positions[used])).any(axis=1).sum())
     if broken:
         raise InputError(f"{source}, mesh '{mesh.name}': {broken} positions are NaN or infinite; export it again")
-    for name in ("uvs", "colors"):
-        values = getattr(mesh, name)
-        if values is not None and not np.isfinite(values[used]).all():
-            raise InputError(f"{source}, mesh '{mesh.name}': its {name} have NaN or infinite values; export it again")
+    for name, (value, what) in FILLED.items():
+        given = getattr(mesh, name)
+        if given is None or np.isfinite(given).all():
+            continue
+        lost = ~np.isfinite(given).all(axis=1)
+        if lost[used].all():
+            raise InputError(f"{source}, mesh '{mesh.name}': its {what} are NaN or infinite; export it again")
+        if lost[used].any():
+            notes(f"mesh '{mesh.name}': {int(lost[used].sum())} {what} that are no numbers set to {value:g}")
+        mesh = replace(mesh, **{name: np.where(lost[:, None], np.float32(value), given)})
     degenerate = _degenerate(mesh.positions, mesh.faces)
     if degenerate.any():
         notes(f"mesh '{mesh.name}': {int(degenerate.sum())} degenerate faces dropped")
