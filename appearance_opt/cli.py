@@ -99,6 +99,10 @@ RefineOption = Annotated[int | None, typer.Option(help="Level to which USD subdi
 MissingTexturesOption = Annotated[
     str | None, typer.Option(help="error or ignore, when the input names a texture that is not there.")
 ]
+CreaseAngleOption = Annotated[
+    float | None,
+    typer.Option(help="STL, PLY, OBJ without normals: edges sharper than this (degrees) are hard [40, more in noise]."),
+]
 RootOption = Annotated[
     str | None, typer.Option(help="Folder in which files that the input refers to may lie, beside its own.")
 ]
@@ -155,6 +159,7 @@ def simplify(
     refine: RefineOption = None,
     missing_textures: MissingTexturesOption = None,
     root: RootOption = None,
+    crease_angle: CreaseAngleOption = None,
     variant: Annotated[list[str] | None, typer.Option(help=VARIANT)] = None,
     device: DeviceOption = None,
     report: ReportOption = None,
@@ -235,6 +240,7 @@ def bake(
     refine: RefineOption = None,
     missing_textures: MissingTexturesOption = None,
     root: RootOption = None,
+    crease_angle: CreaseAngleOption = None,
     variant: Annotated[list[str] | None, typer.Option(help=f"HIGH: {VARIANT}")] = None,
     device: DeviceOption = None,
     joint: Annotated[bool | None, typer.Option("--joint", help="Fit LOW's shape and a displacement, too.")] = None,
@@ -308,6 +314,7 @@ def compare(
     refine: Annotated[int, typer.Option(help="Level to which USD subdivision surfaces are refined.")] = 1,
     missing_textures: MissingTexturesOption = "error",
     root: RootOption = None,
+    crease_angle: CreaseAngleOption = None,
     variant: Annotated[list[str] | None, typer.Option(help=f"REFERENCE: {VARIANT}")] = None,
 ) -> None:
     """Measure how different two assets look: PSNR, FLIP, silhouettes."""
@@ -324,6 +331,7 @@ def compare(
         refine=refine,
         missing_textures=missing_textures,  # type: ignore[arg-type]
         root=root,
+        crease_angle=crease_angle,
         variants=_variants(variant),
     )
     for note in result.notes:
@@ -349,6 +357,7 @@ def inspect(
     refine: Annotated[int, typer.Option(help="Level to which USD subdivision surfaces are refined.")] = 1,
     missing_textures: MissingTexturesOption = "error",
     root: RootOption = None,
+    crease_angle: CreaseAngleOption = None,
     variant: Annotated[list[str] | None, typer.Option(help=VARIANT)] = None,
 ) -> None:
     """Say what is in an asset and what is wrong with it."""
@@ -358,7 +367,12 @@ def inspect(
     from appearance_opt.asset.alpha import counted
     from appearance_opt.asset.validate import inspected
 
-    given = {"variants": _variants(variant), "missing_textures": missing_textures, "root": root}
+    given = {
+        "variants": _variants(variant),
+        "missing_textures": missing_textures,
+        "root": root,
+        "crease_angle": crease_angle,
+    }
     asset = load(source, refine=refine, mend=False, **given)  # type: ignore[arg-type]
     counts, asset = inspected(asset, str(source))
     alpha = {kind: asdict(share) for kind, share in counted(asset).items()}

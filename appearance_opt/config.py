@@ -46,7 +46,8 @@ class CommonOptions:
     a new one takes its place (0: they stay). ``fit``: what moves. ``*_rate``: learning rates, positions in units of
     the local edge length; by default they follow from how good the start is. ``refine``: level for USD subdivision
     surfaces. ``missing_textures``: "error" or "ignore", when an input names a texture that is not there.
-    ``root``: folder in which files that inputs refer to may lie, beside their own. ``seed``: of everything random.
+    ``root``: folder in which files that inputs refer to may lie, beside their own. ``crease_angle``: see
+    ``asset.load``, in degrees. ``seed``: of everything random.
     ``subdivision``: tessellation levels of a displaced result (none given: 3); ``write_tessellated``: write those
     meshes, too. Raises InputError for values that make no sense.
     """
@@ -71,6 +72,7 @@ class CommonOptions:
     refine: int = 1
     missing_textures: MissingTextures = "error"
     root: str | None = None
+    crease_angle: float | None = None
     subdivision: tuple[int, ...] = ()
     write_tessellated: bool = False
     device: str = "auto"
@@ -86,6 +88,8 @@ class CommonOptions:
         _require(self.budget is None or self.budget > 0, "budget", self.budget, "a positive time such as 60s")
         _require(self.seed >= 0, "seed", self.seed, "0 or more")
         _require(0 <= self.refine <= 5, "refine", self.refine, "from 0 to 5")
+        angle = self.crease_angle
+        _require(angle is None or 0 <= angle <= 180, "crease-angle", angle, "from 0 to 180 degrees")
         for level in self.subdivision:
             _require(0 <= level <= MAX_SUBDIVISION, "subdivision", level, f"from 0 to {MAX_SUBDIVISION}")
         _require(self.displaced or not self.subdivision, "subdivision", self.subdivision, self._needs)

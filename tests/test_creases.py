@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from appearance_opt import bake_options, compare, simplify_options
 from appearance_opt.asset import load
 from appearance_opt.asset.creases import Edges, shaded, smooth_by_angle, split
 from appearance_opt.asset.normals import unit, vertex_normals
@@ -16,6 +17,7 @@ from appearance_opt.asset.types import Asset, Mesh, srgb_to_linear
 from appearance_opt.baking.low import movable, unwrapped
 from appearance_opt.errors import InputError
 from appearance_opt.initial.decimate import decimate
+from appearance_opt.jobs.simplify import loaded
 from appearance_opt.latent.latent import LatentMesh
 
 
@@ -164,6 +166,32 @@ def test_smoothing_groups_of_obj_files(tmp_path: Path, statements: str, joined: 
 def test_normals_of_an_obj_file_stay(tmp_path: Path) -> None:
     (tmp_path / "x.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nvn 1 0 0\ns off\nf 1//1 2//1 3//1\n")
     np.testing.assert_array_equal(load(tmp_path / "x.obj").meshes[0].normals, [[1, 0, 0]] * 3)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_angle_may_be_given(tmp_path: Path, kind: str) -> None:
+    rod = trimesh.creation.cylinder(1, 3, sections=12)
+    path = written(tmp_path, kind, rod.vertices, rod.faces)
+    counts = [len(load(path, crease_angle=a).meshes[0].positions) for a in (180, 80, 35, 25)]
+    # two centres; rims that are whole, or split into side and caps; and a pair of vertices for each facet
+    assert counts == [2 + 24, 2 + 48, 2 + 48, 2 + 24 + 48]
+    flat = load(path, crease_angle=0).meshes[0]
+    np.testing.assert_allclose(flat.normals[flat.faces], np.repeat(face_normals(flat)[:, None], 3, 1), atol=1e-6)
+    for wrong in (-1, 181, float("nan")):
+        with pytest.raises(InputError, match=r"--crease-angle .* from 0 to 180"):
+            load(path, crease_angle=wrong)
+        with pytest.raises(InputError, match="crease-angle"):
+            simplify_options(ratio=0.5, crease_angle=wrong)
+
+
+def test_the_angle_reaches_the_reader(tmp_path: Path) -> None:
+    rod = trimesh.creation.cylinder(1, 3, sections=12)
+    path = written(tmp_path, "stl", rod.vertices, rod.faces)
+    for options in (simplify_options(ratio=0.5, crease_angle=180), bake_options(crease_angle=180)):
+        assert len(loaded(path, options).meshes[0].positions) == 26
+    flat = load(path, crease_angle=180)
+    assert compare(path, flat, views=1, resolution=32, samples=4).metrics.psnr_covered < 50
+    assert compare(path, flat, views=1, resolution=32, samples=4, crease_angle=180).metrics.psnr_covered == 99
 
 
 @pytest.mark.parametrize("kind", KINDS)

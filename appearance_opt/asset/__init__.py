@@ -25,6 +25,7 @@ def load(
     variants: dict[str, str] | None = None,
     missing_textures: MissingTextures = "error",
     root: str | Path | None = None,
+    crease_angle: float | None = None,
     keep_layout: bool = False,
     mend: bool = True,
 ) -> Asset:
@@ -34,7 +35,9 @@ def load(
     selections by set name, instead of those in the file; for glTF, {"": name} chooses one of its material variants.
     ``missing_textures``: "error" refuses an asset that names a texture file which is not there, "ignore" goes on
     with the material's constants (without a normal map, if it is
-    that) and a note. ``root``: folder in which files that it refers to may lie, beside its own. ``keep_layout``:
+    that) and a note. ``root``: folder in which files that it refers to may lie, beside its own. ``crease_angle``:
+    of files that say nothing of normals (STL, some PLY and OBJ): degrees between the normals of two faces above which
+    the edge between them is hard; None: 40, and more where the surface is noisy. ``keep_layout``:
     for a mesh to be baked onto, whose vertices and texture coordinates stay as the file has them: no transform of a
     texture is applied to them, and vertices of a mesh without normals are not split at hard edges. Harmless
     faults are repaired and noted in ``Asset.notes``, unless ``mend`` is off. Raises InputError for everything else,
@@ -52,6 +55,8 @@ def load(
         raise InputError(f"--refine {refine}: must be from 0 to {MAX_REFINE}")
     if root is not None and not Path(root).is_dir():
         raise InputError(f"--root {root}: no such folder")
+    if crease_angle is not None and not 0 <= crease_angle <= 180:
+        raise InputError(f"--crease-angle {crease_angle}: must be from 0 to 180 degrees")
     import numpy as np
 
     from appearance_opt.asset.door import reading, with_text_names
@@ -60,13 +65,19 @@ def load(
     # numbers that do not fit a float32 become infinite, which ``repair`` refuses by name
     with reading(path), np.errstate(over="ignore", invalid="ignore"):
         companions = Companions(missing_textures, None if root is None else Path(root))
-        asset = with_text_names(_read(path, suffix, refine, variants, companions, keep_layout))
+        asset = with_text_names(_read(path, suffix, refine, variants, companions, keep_layout, crease_angle))
         asset = replace(asset, files=(path.resolve(), *dict.fromkeys(companions.files)))
         return repair(asset, str(path)) if mend else asset
 
 
 def _read(
-    path: Path, suffix: str, refine: int, variants: dict[str, str] | None, companions: Companions, keep_layout: bool
+    path: Path,
+    suffix: str,
+    refine: int,
+    variants: dict[str, str] | None,
+    companions: Companions,
+    keep_layout: bool,
+    crease_angle: float | None,
 ) -> Asset:
     if suffix in (".glb", ".gltf"):
         from appearance_opt.asset.gltf_read import load_gltf
@@ -77,15 +88,15 @@ def _read(
     if suffix == ".obj":
         from appearance_opt.asset.obj import load_obj
 
-        return load_obj(path, companions, keep_layout)
+        return load_obj(path, companions, keep_layout, crease_angle)
     if suffix == ".ply":
         from appearance_opt.asset.ply import load_ply
 
-        return load_ply(path, companions, keep_layout)
+        return load_ply(path, companions, keep_layout, crease_angle)
     if suffix == ".stl":
         from appearance_opt.asset.stl import load_stl
 
-        return load_stl(path, keep_layout)
+        return load_stl(path, keep_layout, crease_angle)
     from appearance_opt.asset.usd_read import load_usd
 
     return load_usd(path, refine, variants, companions, keep_layout)

@@ -78,22 +78,28 @@ class Edges:
         return cls(np.stack([start[a], end[a]], axis=1), np.stack([a // 3, b // 3], axis=1), corners)
 
 
-def smooth_by_angle(positions: NDArray, faces: NDArray, edges: Edges) -> NDArray[np.bool_]:
-    """(E,) edges that are smooth in a file that says nothing of it.
+def smooth_by_angle(
+    positions: NDArray, faces: NDArray, edges: Edges, crease_angle: float | None = None
+) -> NDArray[np.bool_]:
+    """(E,) edges that are smooth in a file that says nothing of it: those whose faces' normals differ by
+    at most ``crease_angle`` degrees, if that is given.
 
-    Hard are those whose faces' normals differ by more than ``SHARP``, and by more than
+    Else hard are those whose faces' normals differ by more than ``SHARP``, and by more than
     ``NOISE_FACTOR`` times the roughness at the smoother of their ends: so that a noisy scan stays
     smooth. The loose ends of what is left are smooth as well (``LOOSE_ENDS``). ``faces``: of places, see
     ``Edges``."""
     p = np.asarray(positions, np.float64)
-    normal = _face_normals(p, faces)
+    a, b, c = (p[faces[:, k]] for k in range(3))
+    normal = unit(np.cross(b - a, c - a))
     one, other = (normal[edges.faces[:, k]] for k in (0, 1))
-    cosine = np.sum(one * other, axis=1)
+    cosine = np.clip(np.sum(one * other, axis=1), -1, 1)
+    if crease_angle is not None:
+        return cosine >= np.cos(np.radians(crease_angle))
     smooth = cosine >= np.cos(SHARP)
     sharp = np.flatnonzero(~smooth)
     if not len(sharp):
         return smooth
-    angle = np.arccos(np.clip(cosine, -1, 1))
+    angle = np.arccos(cosine)
     apex = faces[edges.faces[:, 1]].sum(axis=1) - edges.ends.sum(axis=1)
     concave = np.sum(one * (p[apex] - p[edges.ends[:, 0]]), axis=1) > 0
     flat = np.any(one, axis=1) & np.any(other, axis=1)  # a face without area is no noise
@@ -111,10 +117,13 @@ def smooth_by_angle(positions: NDArray, faces: NDArray, edges: Edges) -> NDArray
     return smooth
 
 
-def shaded(meshes: Sequence[Mesh], groups: Sequence[NDArray] | None = None) -> list[Mesh]:
+def shaded(
+    meshes: Sequence[Mesh], groups: Sequence[NDArray] | None = None, crease_angle: float | None = None
+) -> list[Mesh]:
     """The meshes with normals where they have none, vertices split at hard edges. ``groups``: the
-    smoothing groups (F,) of the faces of each mesh, 0 for none; without, angles decide. Meshes are one
-    surface where they meet. Faces that ``repair`` refuses leave their mesh as it is."""
+    smoothing groups (F,) of the faces of each mesh, 0 for none; without, angles decide
+    (``smooth_by_angle``). Meshes are one surface where they meet. Faces that ``repair`` refuses leave
+    their mesh as it is."""
     out = list(meshes)
     lacking = [k for k, m in enumerate(meshes) if m.normals is None and in_range(m)]
     if not lacking:
@@ -125,19 +134,13 @@ def shaded(meshes: Sequence[Mesh], groups: Sequence[NDArray] | None = None) -> l
     faces = place[batch.faces]
     edges = Edges.of(faces, len(first))
     if groups is None:
-        smooth = smooth_by_angle(positions[first], faces, edges)
+        smooth = smooth_by_angle(positions[first], faces, edges, crease_angle)
     else:
         smooth = smooth_by_group(np.concatenate([groups[k] for k in lacking]), edges)
     index, new, normals = split(positions, batch.faces, place, edges, smooth)
     for k, mesh in zip(lacking, batch.reindexed(index, new, normals=normals, tangents=None), strict=True):
         out[k] = mesh
     return out
-
-
-def _face_normals(positions: NDArray, faces: NDArray) -> NDArray[np.float64]:
-    """(F, 3) unit normals, zero without area."""
-    a, b, c = (positions[faces[:, k]] for k in range(3))
-    return unit(np.cross(b - a, c - a))
 
 
 def roughness(faces: NDArray, edges: Edges, bend: NDArray, vertices: int) -> NDArray[np.float64]:

@@ -27,8 +27,8 @@ MAX_INDEX = 2**31 - 1
 """Largest index of a face's corner (they are kept in 32 bits)."""
 
 
-def load_obj(path: Path, companions: Companions, keep_layout: bool = False) -> Asset:
-    """Read an OBJ file and its materials. ``keep_layout``: see ``asset.load``. Raises InputError."""
+def load_obj(path: Path, companions: Companions, keep_layout: bool = False, crease_angle: float | None = None) -> Asset:
+    """Read an OBJ file and its materials. ``keep_layout``, ``crease_angle``: see ``asset.load``. Raises InputError."""
     path = Path(path)
     text = re.sub(r"\\\r?\n", " ", read_text(path))
     parser = _Parser(path, companions)
@@ -37,7 +37,7 @@ def load_obj(path: Path, companions: Companions, keep_layout: bool = False) -> A
             parser.line(line)
         except (ValueError, IndexError):
             raise InputError(f"{path}, line {number}: cannot be read: '{line.strip()[:60]}'") from None
-    return parser.asset(keep_layout)
+    return parser.asset(keep_layout, crease_angle)
 
 
 class _Parser:
@@ -122,7 +122,7 @@ class _Parser:
             raise ValueError
         return (out[0], out[1], out[2])
 
-    def asset(self, keep_layout: bool) -> Asset:
+    def asset(self, keep_layout: bool, crease_angle: float | None) -> Asset:
         there = bool(self.uvs), bool(self.normals)
         for k, what in enumerate(("texture coordinates", "normals")):
             if not there[k] and any(key[1 + k] for key in self.polygons):
@@ -139,7 +139,7 @@ class _Parser:
             # once a file says anything of smoothing, faces without a group are flat, as the format says;
             # of one that does not, as scans are, nothing is known
             groups = [np.array(g)[face] for g, (_, face) in zip(self.groups.values(), read, strict=True)]
-            meshes = shaded(meshes, groups if self.says_groups else None)
+            meshes = shaded(meshes, groups if self.says_groups else None, crease_angle)
         meshes = self.materials.placed(meshes, keep_layout)
         return Asset(tuple(meshes), self.path.stem, self.companions.notes.lines(), origin=origin)
 

@@ -35,10 +35,10 @@ _HEADER = 1 << 16
 """Bytes in which the header of a file is looked for the lists of its faces."""
 
 
-def load_ply(path: Path, companions: Companions, keep_layout: bool = False) -> Asset:
+def load_ply(path: Path, companions: Companions, keep_layout: bool = False, crease_angle: float | None = None) -> Asset:
     """Read a .ply file. Without normals, edges sharp by ``creases.smooth_by_angle`` are hard.
-    ``keep_layout``: see ``asset.load``. Raises InputError."""
-    return _Reader(Path(path), companions).asset(keep_layout)
+    ``keep_layout``, ``crease_angle``: see ``asset.load``. Raises InputError."""
+    return _Reader(Path(path), companions).asset(keep_layout, crease_angle)
 
 
 class _Reader:
@@ -52,7 +52,7 @@ class _Reader:
             raise InputError(f"{path}: there are no triangles in it")
         self.vertex, self.face = self.data["vertex"].data, self.data["face"].data
 
-    def asset(self, keep_layout: bool) -> Asset:
+    def asset(self, keep_layout: bool, crease_angle: float | None) -> Asset:
         self.note("no material in this format: a default one is used")
         corners, face_of = self._triangles()
         attributes, index = self._vertices(corners, face_of)
@@ -70,7 +70,7 @@ class _Reader:
             self.note("its colours are not drawn where it has a texture")
         settled, origin = settle(meshes, self.note)
         if not keep_layout:
-            settled = shaded(settled)
+            settled = shaded(settled, crease_angle=crease_angle)
         return Asset(tuple(settled), self.path.stem, self.companions.notes.lines(), origin=origin)
 
     def _triangles(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

@@ -29,9 +29,9 @@ _OWN = 1 << 15
 """The bit that says what the other fifteen of a facet's attribute mean."""
 
 
-def load_stl(path: Path, keep_layout: bool = False) -> Asset:
+def load_stl(path: Path, keep_layout: bool = False, crease_angle: float | None = None) -> Asset:
     """Read an STL file: vertices at one place are one, edges sharp by ``creases.smooth_by_angle`` are
-    hard. ``keep_layout``: see ``asset.load``. Raises InputError."""
+    hard. ``keep_layout``, ``crease_angle``: see ``asset.load``. Raises InputError."""
     path = Path(path)
     data = read_bytes(path)
     notes = ["no material in this format: a default one is used"]
@@ -55,7 +55,7 @@ def load_stl(path: Path, keep_layout: bool = False) -> Asset:
     mesh = Mesh(positions, faces.astype(np.int32), colors=vertex_colors, material=material, name=path.stem)  # type: ignore[arg-type]
     meshes, origin = settle([mesh], notes.append)
     if not keep_layout:
-        meshes = shaded(meshes)
+        meshes = shaded(meshes, crease_angle=crease_angle)
     return Asset(tuple(meshes), path.stem, tuple(notes), origin=origin)
 
 

@@ -45,12 +45,13 @@ def compare(
     refine: int = 1,
     missing_textures: MissingTextures = "error",
     root: str | Path | None = None,
+    crease_angle: float | None = None,
     variants: dict[str, str] | None = None,
 ) -> Comparison:
     """Render both assets from ``views`` random cameras under random lights and measure the difference.
-    ``out``: folder for a report with pictures. ``refine``, ``missing_textures``, ``root``: see ``load``; ``variants``:
-    of the reference. What is transparent is drawn so (see ``render.layers``). Raises AppearanceError, also if one of
-    the two shows nothing."""
+    ``out``: folder for a report with pictures. ``refine``, ``missing_textures``, ``root``, ``crease_angle``: see
+    ``load``; ``variants``: of the reference. What is transparent is drawn so (see ``render.layers``). Raises
+    AppearanceError, also if one of the two shows nothing."""
     from appearance_opt.asset import load
     from appearance_opt.asset.types import Asset
 
@@ -58,10 +59,9 @@ def compare(
         raise InputError(f"--device {device}: choose from {', '.join(DEVICES)}")
     if seed < 0:
         raise InputError(f"--seed {seed}: must be 0 or more")
+    given = {"refine": refine, "missing_textures": missing_textures, "root": root, "crease_angle": crease_angle}
     first, second = (
-        a
-        if isinstance(a, Asset)
-        else load(a, refine=refine, missing_textures=missing_textures, root=root, variants=chosen)
+        a if isinstance(a, Asset) else load(a, variants=chosen, **given)  # type: ignore[arg-type]
         for a, chosen in ((reference, variants), (candidate, None))
     )
     backend.select(device)

@@ -128,7 +128,7 @@ def loaded(source: str | Path | Asset, options: CommonOptions, variants: dict[st
     """``source`` itself, or the file of that name, read as the options say."""
     if not isinstance(source, (str, Path)):
         return source
-    given = {"missing_textures": options.missing_textures, "root": options.root}
+    given = {n: getattr(options, n) for n in ("missing_textures", "root", "crease_angle")}
     return load(source, refine=options.refine, variants=variants, **given)  # type: ignore[arg-type]
 
 
