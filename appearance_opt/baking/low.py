@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from appearance_opt.asset.normals import vertex_normals, weld
+from appearance_opt.asset.sides import single_sided
 from appearance_opt.asset.tangents import split_and_tangents
 from appearance_opt.asset.types import Asset, Material
 from appearance_opt.latent.latent import LatentMesh
@@ -50,6 +51,7 @@ def prepare(asset: Asset) -> Low:
     positions, uvs, normals, tangents = (np.concatenate([p[k] for p in parts]) for k in (0, 2, 3, 4))
     faces = np.concatenate([p[1] + s for p, s in zip(parts, start, strict=True)]).astype(np.int32)
     latent = LatentMesh(positions, faces, np.arange(len(positions), dtype=np.int32), faces, uvs, normals, tangents)
+    latent = replace(latent, single=single_sided(asset.meshes))
     return Low(replace(asset, meshes=tuple(meshes)), latent)
 
 
@@ -68,6 +70,7 @@ def movable(mesh: LatentMesh) -> LatentMesh:
         frame_vertex=place[mesh.frame_vertex].astype(np.int32),
         frame_faces=mesh.frame_faces,
         uvs=mesh.uvs,
+        single=mesh.single,
     )
 
 
@@ -79,7 +82,7 @@ def unwrapped(asset: Asset, size: int) -> Asset:
     start = np.cumsum([0] + [len(m.positions) for m in asset.meshes])
     positions = np.concatenate([m.positions for m in asset.meshes])
     faces = np.concatenate([m.faces + s for m, s in zip(asset.meshes, start, strict=False)])
-    latent = unwrap(positions, faces, size)
+    latent = unwrap(positions, faces, size, single=single_sided(asset.meshes))
     meshes, first = [], 0
     for k, mesh in enumerate(asset.meshes):
         corner = latent.frame_faces[first : first + len(mesh.faces)]

@@ -9,6 +9,7 @@ import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
+from appearance_opt.initial.sheets import separated
 from appearance_opt.latent.latent import LatentMesh
 
 if TYPE_CHECKING:
@@ -27,14 +28,17 @@ FILLED, TRIES, SMALLEST = 0.6, 3, 0.5
 corrected, and down to which part of it. Beyond that the gutters become narrower."""
 
 
-def unwrap(positions: NDArray, faces: NDArray, resolution: int, gutter: int = GUTTER) -> LatentMesh:
+def unwrap(
+    positions: NDArray, faces: NDArray, resolution: int, gutter: int = GUTTER, single: NDArray | None = None
+) -> LatentMesh:
     """Charts for all faces, with equally many texels per area, packed for a texture of ``resolution`` texels."""
-    return packed(charted(positions, faces), np.ones(len(faces)), resolution, gutter)
+    return packed(charted(positions, faces, single), np.ones(len(faces)), resolution, gutter)
 
 
-def charted(positions: NDArray, faces: NDArray) -> LatentMesh:
+def charted(positions: NDArray, faces: NDArray, single: NDArray | None = None) -> LatentMesh:
     """Charts for all faces. UVs are as long as what they stand for (in units of the longest side of the mesh's box),
-    and charts lie side by side, anywhere.
+    and charts lie side by side, anywhere. ``single`` (F,): faces that are seen from their front only, None for none;
+    where such sheets lie back to back, each side gets vertices and charts of its own (see ``sheets``).
 
     glTF convention (v downward). Render vertices are also split where a vertex lies on charts of both
     handednesses, so that each has one tangent frame.
@@ -44,24 +48,30 @@ def charted(positions: NDArray, faces: NDArray) -> LatentMesh:
     # xatlas welds and measures with absolute thresholds: give it a unit-sized object
     centre = (positions.min(axis=0) + positions.max(axis=0)) / 2
     scale = max(float(np.ptp(positions, axis=0).max()), 1e-300)
+    sheets = separated(positions, faces, single)
     atlas = xatlas.Atlas()
-    unit = ((positions - centre) / scale).astype(np.float32)
-    atlas.add_mesh(np.ascontiguousarray(unit), np.ascontiguousarray(faces, np.uint32))
+    unit = ((sheets.positions - centre) / scale).astype(np.float32)
+    # vertices at one place are one to xatlas: what lies back to back is a mesh of its own
+    parts = [np.flatnonzero(~sheets.behind), np.flatnonzero(sheets.behind)]
+    parts = [own for own in parts if len(own)]
+    for own in parts:
+        atlas.add_mesh(np.ascontiguousarray(unit), np.ascontiguousarray(sheets.faces[own], np.uint32))
     chart = xatlas.ChartOptions()
     chart.max_iterations = 2
     atlas.generate(chart_options=chart, pack_options=_pack_options(1024, GUTTER, 0.0))
-    vertex, frames, uvs = atlas[0]
+    vertex, frames, uvs = _joined(atlas, parts)
     # xatlas stretches the texture, which is as wide and high as it likes, to the unit square
     side = np.array([atlas.width, atlas.height], np.float32) / np.float32(max(atlas.texels_per_unit, 1e-30))
     charts = LatentMesh(
-        positions=np.asarray(positions, np.float32),
-        faces=np.asarray(faces, np.int32),
+        positions=np.asarray(sheets.positions, np.float32),
+        faces=np.asarray(sheets.faces, np.int32),
         frame_vertex=np.asarray(vertex, np.int32),
         frame_faces=np.asarray(frames, np.int32),
         uvs=np.nan_to_num(np.asarray(uvs, np.float32)) * side,
+        single=single if single is not None and single.any() else None,
     )
     left = uv_areas(charts) <= 0
-    return _with_single_faces(charts, left, (positions - centre) / scale) if left.any() else charts
+    return _with_single_faces(charts, left, (sheets.positions - centre) / scale) if left.any() else charts
 
 
 def _with_single_faces(charts: LatentMesh, left: NDArray[np.bool_], positions: NDArray) -> LatentMesh:
@@ -91,6 +101,18 @@ def _with_single_faces(charts: LatentMesh, left: NDArray[np.bool_], positions: N
         frame_faces=frames.astype(np.int32),
         uvs=np.concatenate([charts.uvs, flat.reshape(-1, 2)]).astype(np.float32),
     )
+
+
+def _joined(atlas: xatlas.Atlas, parts: list[NDArray]) -> tuple[NDArray, NDArray, NDArray]:
+    """(vertex of each render vertex, faces, UVs) of all meshes of an atlas, the faces at the numbers ``parts``."""
+    if len(parts) == 1:
+        return atlas[0]
+    meshes = [atlas[k] for k in range(len(parts))]
+    start = np.cumsum([0] + [len(m[0]) for m in meshes[:-1]])
+    faces = np.empty((sum(len(p) for p in parts), 3), np.int64)
+    for own, mesh, first in zip(parts, meshes, start, strict=True):
+        faces[own] = np.asarray(mesh[1], np.int64) + first
+    return np.concatenate([m[0] for m in meshes]), faces, np.concatenate([m[2] for m in meshes])
 
 
 def packed(

@@ -130,9 +130,9 @@ class Exporter:
     """Assets of a displaced model, in the place and scale of the input, relative to its ``origin``.
     ``centre``, in the world, and ``scale``: of the frame in which the model was fitted."""
 
-    def __init__(self, centre: Origin, scale: float, origin: Origin, name: str, double_sided: bool) -> None:
+    def __init__(self, centre: Origin, scale: float, origin: Origin, name: str) -> None:
         self.centre, self.scale = np.array(centre) - np.array(origin), scale
-        self.origin, self.name, self.double_sided = origin, name, double_sided
+        self.origin, self.name = origin, name
 
     def base(self, model: Model, maps: dict) -> Asset:
         """The base mesh, its maps, and the displacement map in metres."""
@@ -140,9 +140,9 @@ class Exporter:
         heights = model.host_displacement()
         if heights is None:
             return asset
-        mesh = asset.meshes[0]
-        material = replace(mesh.material, displacement=displacement_of(heights * np.float32(self.scale)))
-        return replace(asset, meshes=(replace(mesh, material=material),))
+        displacement = displacement_of(heights * np.float32(self.scale))
+        meshes = (replace(m, material=replace(m.material, displacement=displacement)) for m in asset.meshes)
+        return replace(asset, meshes=tuple(meshes))
 
     def drawn(self, model: Model, maps: dict) -> dict[int, Asset]:
         """The mesh as it is drawn at each tessellation level."""
@@ -150,7 +150,7 @@ class Exporter:
 
     def _asset(self, mesh: LatentMesh, positions: NDArray, maps: dict, name: str) -> Asset:
         placed = positions.astype(np.float64) * self.scale + self.centre
-        return replace(to_asset(mesh, placed, maps, name, self.double_sided), origin=self.origin)
+        return replace(to_asset(mesh, placed, maps, name), origin=self.origin)
 
 
 def write_levels(tessellated: dict[int, Asset], out: Path) -> None:

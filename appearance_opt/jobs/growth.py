@@ -106,7 +106,7 @@ def mended(
     small = with_values(options, texture_size=min(TEXTURE, options.texture_size))
     maps = transferred(reference, spoilt, small).maps
     model, result = _shaped(reference, sampler, options, spoilt, maps, MENDING, effort)
-    mesh = unwrap(model.host_positions(), spoilt.faces, options.texture_size)
+    mesh = unwrap(model.host_positions(), spoilt.faces, options.texture_size, single=spoilt.single)
     return transferred(reference, mesh, options), result.interrupted
 
 
@@ -172,21 +172,27 @@ def kept(path: Path, fingerprint: str, make: Callable[[], tuple[Start, bool]]) -
         except archive.UNREADABLE as error:
             raise InputError(f"{path}: not a usable start ({error}); delete it to begin anew") from error
     start, interrupted = make()
-    arrays = {name: getattr(start.mesh, name) for name in _MESH}
-    arrays.update({f"map/{name}": np.asarray(value) for name, value in start.maps.items()})
-    if start.finest is not None:
-        arrays.update({f"finest/{name}": getattr(start.finest, name) for name in _MESH})
+    arrays = {f"map/{name}": np.asarray(value) for name, value in start.maps.items()}
+    for prefix, mesh in (("", start.mesh), ("finest/", start.finest)):
+        if mesh is not None:
+            arrays.update({prefix + n: getattr(mesh, n) for n in _MESH if getattr(mesh, n) is not None})
     arrays.update({name: np.asarray(getattr(start, name)) for name in ("known", "grown", "relative", "levels")})
     archive.write(path, fingerprint, arrays)
     return start, interrupted
 
 
-_MESH = ("positions", "faces", "frame_vertex", "frame_faces", "uvs")
+_MESH = ("positions", "faces", "frame_vertex", "frame_faces", "uvs", "single")
 
 
 def _start(arrays: dict[str, NDArray]) -> Start:
     maps = {k[4:]: v if v.ndim else float(v) for k, v in arrays.items() if k.startswith("map/")}
-    mesh = LatentMesh(*(arrays[name] for name in _MESH))
-    finest = LatentMesh(*(arrays[f"finest/{name}"] for name in _MESH)) if "finest/faces" in arrays else None
+    mesh, finest = (
+        LatentMesh(**{n: arrays[prefix + n] for n in _MESH if prefix + n in arrays})
+        if prefix + "faces" in arrays
+        else None
+        for prefix in ("", "finest/")
+    )
+    if mesh is None:
+        raise KeyError("faces")
     levels = tuple(int(level) for level in arrays["levels"])
     return Start(mesh, maps, bool(arrays["relative"]), arrays["known"], levels, finest, bool(arrays["grown"]))

@@ -95,8 +95,7 @@ def _fitted(job: BakeJob, options: BakeOptions, progress: Progress | None, with_
         progress=progress,
         with_report=with_report,
     )
-    double_sided = any(m.material.double_sided for m in light.meshes)
-    exporter = Exporter(*job.frame, light.origin, light.name, double_sided)
+    exporter = Exporter(*job.frame, light.origin, light.name)
     initial = Model(mesh, start.maps, frozenset(), Rates(), start.levels[-1:])
     final = clean_maps(model, start.known)
     if options.wants("emission"):

@@ -146,7 +146,7 @@ class _Job:
     ) -> None:
         from appearance_opt.jobs.fitting import seconds_left
         from appearance_opt.jobs.growth import grown, mended
-        from appearance_opt.jobs.start import budget, loaded_mesh, make_start, transferred
+        from appearance_opt.jobs.start import budget, loaded_mesh, make_start, sided, transferred
         from appearance_opt.reference.mesh import MeshReference
         from appearance_opt.views import ViewSampler, framing
 
@@ -173,7 +173,9 @@ class _Job:
             left = seconds_left(options, watch, with_report)
             self.start = self._kept(lambda: make_start(self.reference, options, self.sampler, triangles, left))
         else:
-            mesh, notes = loaded_mesh(Path(options.init), self.frame, asset.triangle_count, options)
+            mesh, notes = loaded_mesh(
+                Path(options.init), self.frame, asset.triangle_count, options, self.reference.single
+            )
             self.notes += notes
             if options.relative is False and "shape" in options.fit and not options.displaced:
                 self.start = self._shaped(lambda effort: mended(self.reference, self.sampler, options, mesh, effort))
@@ -181,6 +183,7 @@ class _Job:
                 self.options = with_values(self.options, relative=None)
             else:
                 self.start = self._kept(lambda: transferred(self.reference, mesh, options))
+        self.start = sided(self.start, self.reference.single)
         watch.lap("start")
 
     def _kept(self, make: Callable[[], Start]) -> Start:
@@ -238,8 +241,7 @@ class _Job:
         )
         asset = self.parts.fitted
         name = f"{asset.name}_{len(self.start.mesh.faces)}"
-        double_sided = any(m.material.double_sided for m in asset.meshes)
-        exporter = Exporter(*self.frame, asset.origin, name, double_sided)
+        exporter = Exporter(*self.frame, asset.origin, name)
         initial = Model(self.start.mesh, self.start.maps, frozenset(), Rates(), self.start.levels[-1:])
         begin = exporter.drawn(initial, self.start.maps)[initial.level]
         maps = clean_maps(model, self.start.known)

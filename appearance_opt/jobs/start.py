@@ -12,7 +12,7 @@ import numpy as np
 
 from appearance_opt.errors import InputError
 from appearance_opt.initial.atlas import charted, packed, unwrap
-from appearance_opt.initial.decimate import decimate
+from appearance_opt.initial.decimate import decimate_with_source
 from appearance_opt.initial.density import chart_scales
 from appearance_opt.initial.reallocate import StartError, weights
 from appearance_opt.initial.sphere import SMALLEST as SMALLEST_SPHERE
@@ -150,10 +150,12 @@ class _Decimated:
         """The reference decimated with these importances of its faces (F,)."""
         merged, visible = self.reference.merged, self.visible
         single = self.reference.single[visible]
-        positions, faces = decimate(merged.positions, merged.faces[visible], self.triangles, weight[visible], single)
+        positions, faces, source = decimate_with_source(
+            merged.positions, merged.faces[visible], self.triangles, weight[visible], single
+        )
         if not len(faces):
             raise InputError("nothing is left of this mesh at that budget; ask for more triangles")
-        return self._mapped(charted(positions, faces), np.ones(len(faces)), False)
+        return self._mapped(charted(positions, faces, single[source]), np.ones(len(faces)), False)
 
     def moved(self, start: Start, judge: StartError, rounds: int) -> tuple[Start, float]:
         """The best of a start and those with triangles moved to where its image error is, and its error."""
@@ -201,14 +203,31 @@ def transferred(reference: MeshReference, mesh: LatentMesh, options: SimplifyOpt
     return Start(mesh, {**maps, **displacement}, True, result.covered, options.levels(), finest)
 
 
+def sided(start: Start, single: NDArray[np.bool_]) -> Start:
+    """A start whose triangles stem from none of the reference's, of which those in ``single`` are seen from their front
+    only: so are all of its triangles if all of these are."""
+    if start.mesh.single is not None or not single.all():
+        return start
+    meshes = (None if m is None else replace(m, single=np.ones(len(m.faces), bool)) for m in (start.mesh, start.finest))
+    mesh, finest = meshes
+    assert mesh is not None
+    return replace(start, mesh=mesh, finest=finest)
+
+
 def loaded_mesh(
-    path: Path, frame: tuple[tuple[float, float, float], float], available: int, options: SimplifyOptions
+    path: Path,
+    frame: tuple[tuple[float, float, float], float],
+    available: int,
+    options: SimplifyOptions,
+    sides: NDArray[np.bool_],
 ) -> tuple[LatentMesh, list[str]]:
     """(the mesh of a file, moved to a ``frame`` (centre, scale), with a new atlas; notes). ``available``: triangles of
-    the reference. Transparent parts are left out, for those of the input pass into the result. Raises InputError when
-    it has more triangles than were asked for."""
+    the reference; ``sides``: those that are seen from their front only. If either all or none are, so it is with the
+    mesh; else its file decides. Transparent parts are left out, for those of the input pass into the result. Raises
+    InputError when it has more triangles than were asked for."""
     from appearance_opt.asset import load
     from appearance_opt.asset.normals import weld
+    from appearance_opt.asset.sides import single_sided
 
     # its own maps are not used: it may lack them
     given = load(path, refine=options.refine, missing_textures="ignore", root=options.root, keep_layout=True)
@@ -225,5 +244,8 @@ def loaded_mesh(
     faces = place[f].astype(np.int32)
     require_memory(len(faces), options)
     offset = np.array(asset.origin) - np.array(centre)
-    mesh = unwrap((p[first] + offset) / scale, faces, options.texture_size, gutter(len(faces), options))
+    single = single_sided(asset.meshes)
+    if sides.all() or not sides.any():
+        single[:] = sides.all()
+    mesh = unwrap((p[first] + offset) / scale, faces, options.texture_size, gutter(len(faces), options), single)
     return mesh, parts.told("of --init are left out: those of the input pass into the result")

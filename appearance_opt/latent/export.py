@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -20,10 +21,9 @@ if TYPE_CHECKING:
     from appearance_opt.latent.latent import LatentMesh
 
 
-def to_asset(
-    mesh: LatentMesh, positions: NDArray, maps: Mapping[str, NDArray | float], name: str, double_sided: bool = True
-) -> Asset:
-    """One mesh, one material. ``positions`` (V, 3); ``maps``: natural values by channel name, images or
+def to_asset(mesh: LatentMesh, positions: NDArray, maps: Mapping[str, NDArray | float], name: str) -> Asset:
+    """One mesh, one material; two, with the same textures, where some faces are seen from both sides and
+    others from their front only. ``positions`` (V, 3); ``maps``: natural values by channel name, images or
     numbers. Normals are angle weighted and tangents MikkTSpace's: what the renderer of the fit uses, so
     that the maps mean the same in another one."""
     p, tangents = positions[mesh.frame_vertex], None
@@ -33,23 +33,39 @@ def to_asset(
     if np.ndim(maps.get("normal_x", 0.0)):
         index, faces, tangents = split_and_tangents(p, n, uv, faces)
         p, n, uv = p[index], n[index], uv[index]
-    return Asset(
-        (
-            Mesh(
-                positions=np.ascontiguousarray(p, np.float32),
-                faces=np.ascontiguousarray(faces, np.int32),
-                normals=n,
-                uvs=uv,
-                tangents=tangents,
-                material=_material(maps, name, double_sided),
-                name=name,
-            ),
-        ),
-        name,
+    whole = Mesh(
+        positions=np.ascontiguousarray(p, np.float32),
+        faces=np.ascontiguousarray(faces, np.int32),
+        normals=n,
+        uvs=uv,
+        tangents=tangents,
+        material=_material(maps, name),
+        name=name,
     )
+    return Asset(_by_side(whole, mesh.single), name)
 
 
-def _material(maps: Mapping[str, NDArray | float], name: str, double_sided: bool) -> Material:
+def _by_side(mesh: Mesh, single: NDArray[np.bool_] | None) -> tuple[Mesh, ...]:
+    """A mesh whose material is double-sided, or what is so of it, and those of its faces (``single`` (F,)) that are
+    seen from their front only."""
+    if single is None or not single.any():
+        return (mesh,)
+    one_way = replace(mesh.material, double_sided=False)
+    if single.all():
+        return (replace(mesh, material=one_way),)
+    one_way = replace(one_way, name=f"{mesh.name}_single_sided")
+    return _part(mesh, ~single), replace(_part(mesh, single), material=one_way, name=one_way.name)
+
+
+def _part(mesh: Mesh, faces: NDArray[np.bool_]) -> Mesh:
+    """Some faces of a mesh, with the vertices that they use."""
+    used, corners = np.unique(mesh.faces[faces], return_inverse=True)
+    arrays = {n: getattr(mesh, n) for n in ("positions", "normals", "uvs", "tangents")}
+    kept = {n: None if v is None else v[used] for n, v in arrays.items()}
+    return replace(mesh, faces=corners.reshape(-1, 3).astype(np.int32), **kept)  # type: ignore[arg-type]
+
+
+def _material(maps: Mapping[str, NDArray | float], name: str) -> Material:
     def stacked(*names: str) -> NDArray | None:
         values = [np.asarray(maps.get(n, 0.0), np.float32) for n in names]
         shapes = [v.shape for v in values if v.ndim]
@@ -82,7 +98,6 @@ def _material(maps: Mapping[str, NDArray | float], name: str, double_sided: bool
         base_color_texture=None if base is None else Texture(_srgb8(base), "srgb", clamp),  # type: ignore[arg-type]
         orm_texture=None if orm is None else Texture(_8(orm), "linear", clamp),  # type: ignore[arg-type]
         normal_texture=None if normal is None else Texture(_8(normal * 0.5 + 0.5), "linear", clamp),  # type: ignore[arg-type]
-        double_sided=double_sided,
         emission=emission,
         emission_texture=emission_texture,
     )

@@ -57,7 +57,8 @@ def tessellate(mesh: LatentMesh, level: int) -> Tessellation:
         combination = sp.vstack([combination, middle], "csr")
     parents, weights = _rows(combination)
     positions = np.einsum("nk,nkc->nc", weights, mesh.positions[parents])
-    fine = LatentMesh(positions.astype(np.float32), faces, frame_vertex, frames, uvs)
+    single = None if mesh.single is None else np.repeat(mesh.single, 4**level)
+    fine = LatentMesh(positions.astype(np.float32), faces, frame_vertex, frames, uvs, single=single)
     return Tessellation(level, fine, parents, weights)
 
 
