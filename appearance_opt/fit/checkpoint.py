@@ -37,10 +37,11 @@ class FitState:
     best: dict[str, mi.Float] | None = None
     best_psnr: float = -np.inf
     best_iteration: int = 0
+    unfolded: int = 0
     curve: list[tuple[float, int, float, float]] = field(default_factory=list)
 
 
-_NUMBERS = ("iteration", "loss", "laplacian", "skipped", "seconds", "best_psnr", "best_iteration")
+_NUMBERS = ("iteration", "loss", "laplacian", "skipped", "seconds", "best_psnr", "best_iteration", "unfolded")
 
 
 class Checkpointer:

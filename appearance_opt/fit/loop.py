@@ -12,6 +12,7 @@ import numpy as np
 from appearance_opt.errors import DivergedError
 from appearance_opt.fit import adam
 from appearance_opt.fit.checkpoint import Checkpointer, FitState
+from appearance_opt.fit.folds import Folds
 from appearance_opt.fit.laplacian import Laplacian
 from appearance_opt.fit.losses import loss_of_name
 from appearance_opt.fit.model import POSITIONS, Model
@@ -51,7 +52,8 @@ Background = str | tuple[float, float, float]
 class FitOptions:
     """How to fit. ``steps``/``seconds``: when to stop (at least one, or ValueError). ``loss``: a name of
     ``losses.LOSSES``. ``laplacian``: weight relative to the first image loss, at a deviation of a tenth of an edge
-    length (0: none). ``relative``: hold the Laplacian of the start rather than 0. ``decay``: powers of ten by which
+    length (0: none). ``relative``: the start is a likeness: hold its Laplacian rather than 0, and hand out no triangle
+    that has turned over since (see ``folds``). ``decay``: powers of ten by which
     the rates fall over the fit. ``background``: behind latent and reference. ``quality``: how the latent is sampled;
     its point width is the pool's. ``validate_every``: fraction of the fit between looks at the held-out views.
     ``seed``: of backgrounds, tessellation levels and silhouette points; views have the sampler's."""
@@ -84,7 +86,8 @@ class CurvePoint:
 
 @dataclass
 class FitResult:
-    """What a fit did. The model is left at its best state by held-out PSNR, the start included."""
+    """What a fit did. The model is left at its best state by held-out PSNR, the start included. ``unfolded``: triangles
+    of that state that had turned over and were turned back."""
 
     curve: list[CurvePoint] = field(default_factory=list)
     steps: int = 0
@@ -92,12 +95,15 @@ class FitResult:
     seconds: float = 0.0
     interrupted: bool = False
     best_step: int = 0
+    unfolded: int = 0
 
     def notes(self) -> list[str]:
         """What the user should know about it, a line each."""
         out = []
         if self.skipped:
             out.append(f"{self.skipped} steps with non-finite gradients were skipped")
+        if self.unfolded:
+            out.append(f"{self.unfolded} triangles that the fit had turned over were turned back")
         if self.interrupted:
             out.append(f"interrupted after {self.steps} steps: this is the best state so far")
         return out
@@ -161,6 +167,9 @@ class _Run:
         self.laplacians: dict[int, Laplacian] = {}
         if {POSITIONS, DISPLACEMENT} & set(model.parameters) and options.laplacian > 0:
             self.laplacians = laplacians(model, options.relative)
+        self.folds: Folds | None = None
+        if POSITIONS in model.parameters and options.relative:
+            self.folds = Folds(model.mesh.positions, model.mesh.faces)
         if checkpointer is not None and checkpointer.restore(model, self.state):
             self.result.curve = [CurvePoint(*p) for p in self.state.curve]
         self.gradients = Gradients(model, self.grid, self.quality, self.loss, self.laplacians)
@@ -212,6 +221,7 @@ class _Run:
     def look(self) -> None:
         """Render the held-out views; remember the state if it is the best so far."""
         state = self.state
+        unfolded = self._unfold()
         current = self.model.values()
         means = {name: moments.mean for name, moments in state.moments.items()}
         try:
@@ -224,6 +234,17 @@ class _Run:
             self.result.curve.append(point)
         if state.best is None or self.psnr > state.best_psnr:
             state.best, state.best_psnr, state.best_iteration = means, self.psnr, state.iteration
+            state.unfolded = unfolded
+
+    def _unfold(self) -> int:
+        """Turn folded triangles back, of the means and of where the next step starts. How many the means had."""
+        if self.folds is None or self.state.best is None:
+            return 0
+        parameter, moments = self.model.parameters[POSITIONS], self.state.moments[POSITIONS]
+        safe = self.state.best[POSITIONS]
+        moments.mean, count = self.folds.undo(moments.mean, safe)
+        parameter.value, _ = self.folds.undo(parameter.value, safe)
+        return count
 
     def finish(self, look: bool) -> None:
         """A last look, then back to the best state."""
@@ -235,6 +256,7 @@ class _Run:
             self.model.restore(self.state.best)
         self.result.steps = self.state.iteration
         self.result.best_step = self.state.best_iteration
+        self.result.unfolded = self.state.unfolded
         self.result.skipped = self.state.skipped
         self.result.seconds = self.clock.time()
 

@@ -16,6 +16,7 @@ from appearance_opt.asset.normals import accumulate, unit, weld
 from appearance_opt.initial import quadrics
 from appearance_opt.initial.collapse import STRICT, TEARING, TURNING, State, collapse, legal
 from appearance_opt.initial.edges import Sides, edges_of, keys, touching
+from appearance_opt.initial.flips import flip_edges
 from appearance_opt.initial.parts import drop_cheap_parts, drop_smallest_parts
 from appearance_opt.initial.stacks import without_stacks
 
@@ -103,6 +104,7 @@ def decimate_with_source(
             pass
     if len(state.faces) > triangles:
         state.keep(np.zeros(len(state.faces), bool))
+    state.faces, _ = flip_edges(state.positions, state.faces, single[state.source])
     used, compact = np.unique(state.faces, return_inverse=True)
     return state.positions[used] * scale + centre, compact.reshape(-1, 3).astype(np.int32), state.source
 

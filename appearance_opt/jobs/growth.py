@@ -131,6 +131,7 @@ def _shaped(
         seconds=effort.seconds,
         loss=options.loss,
         laplacian=0.0,
+        relative=False,
         decay=1.0,
         background=options.background_color(),
         seed=options.seed,

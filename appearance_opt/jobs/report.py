@@ -179,6 +179,7 @@ def _facts(result: SimplifyResult, options: CommonOptions) -> dict[str, object]:
         "triangles": f"{result.triangles} of {result.source_triangles}",
         "steps": f"{fit.steps} ({fit.steps / max(fit.seconds, 1e-9):.1f} per second), best at {fit.best_step}",
         "skipped steps": fit.skipped,
+        "triangles turned back": fit.unfolded,
         "seconds by stage": ", ".join(f"{k} {v:.1f}" for k, v in result.seconds.items()),
     }
     return {**facts, **_settings(options)}

@@ -1,0 +1,94 @@
+"""Flat regions end without slivers: edges are flipped where that changes no surface and makes better triangles."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from appearance_opt.initial.edges import keys, sides_of, touching
+
+FLAT = 0.06
+"""How far apart the two diagonals of four corners may lie for their edge to be flipped, in units of the square root of
+the area between them."""
+
+POOR = 0.3
+"""Quality below which a triangle is to be made better: others stay as the decimation chose them."""
+
+GAIN = 1.1
+"""How many times better the worse of the two triangles must get: from fans to strips it takes many small steps."""
+
+ROUNDS = 30
+"""At most. Each flip makes the worse triangle of two better; measured: 3 to 12 rounds."""
+
+
+def quality(a: NDArray, b: NDArray, c: NDArray) -> NDArray[np.float64]:
+    """(N,) 4 sqrt(3) area over the sum of the squared sides of triangles with corners (N, 3): 1 if equilateral, 0 if
+    its corners lie on a line (Bank and Smith 1997)."""
+    area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=-1)
+    squared = sum(np.sum((u - v) ** 2, axis=-1) for u, v in ((a, b), (b, c), (c, a)))
+    return 4 * 3**0.5 * area / np.maximum(squared, 1e-300)
+
+
+def flip_edges(positions: NDArray, faces: NDArray, kind: NDArray) -> tuple[NDArray[np.int64], int]:
+    """(faces (F, 3), flips): nearly the same surface (see ``FLAT``) with fewer triangles below ``POOR``.
+
+    Only edges of two faces of equal ``kind`` (F,) are flipped, and only to where no edge is: borders, creases and edges
+    of more than two faces stay. A face keeps the index of one of the two that it came from.
+    """
+    faces, total = faces.astype(np.int64), 0
+    around = faces[quality(*(positions[faces[:, k]] for k in range(3))) < POOR].ravel()
+    for _ in range(ROUNDS):
+        marked = np.zeros(len(positions), bool)
+        marked[around] = True
+        # all edges at a marked vertex, with all of their faces
+        near = np.flatnonzero(touching(marked, faces))
+        part = faces[near]
+        won, around = _flip_best(positions, part, kind[near], marked)
+        if not won:
+            break
+        faces[near] = part
+        total += won
+    return faces, total
+
+
+def _flip_best(positions: NDArray, faces: NDArray, kind: NDArray, marked: NDArray) -> tuple[int, NDArray]:
+    """Flip the best edges around, of those at ``marked`` vertices; ``faces`` are changed. (How many there were,
+    vertices around which there may be more)."""
+    sides = sides_of(faces)
+    first, last, opposite = sides.corners(faces)
+    known = keys(first[sides.start], last[sides.start])
+    pair = sides.start[sides.uses == 2]
+    f, g = sides.face[pair], sides.face[pair + 1]
+    poor = quality(*(positions[faces[:, k]] for k in range(3))) < POOR
+    ok = (poor[f] | poor[g]) & (first[pair + 1] == last[pair]) & (kind[f] == kind[g])
+    f, g, pair = f[ok], g[ok], pair[ok]
+    a, b, c, d = first[pair], last[pair], opposite[pair], opposite[pair + 1]
+    new = keys(c, d)
+    allowed = (c != d) & (marked[a] | marked[b]) & (marked[c] | marked[d]) & ~np.isin(new, known)
+    gain = np.where(allowed, _gain(*(positions[x] for x in (a, b, c, d))), 0.0)
+    wanted = np.flatnonzero(gain > GAIN)
+    # each face takes part in one flip, each new edge comes from one
+    wanted = wanted[np.argsort(-gain[wanted], kind="stable")]
+    wanted = wanted[np.sort(np.unique(new[wanted], return_index=True)[1])]
+    best, rank = np.full(len(faces), len(wanted)), np.arange(len(wanted))
+    np.minimum.at(best, f[wanted], rank)
+    np.minimum.at(best, g[wanted], rank)
+    won = wanted[(best[f[wanted]] == rank) & (best[g[wanted]] == rank)]
+    faces[f[won]] = np.stack([a[won], d[won], c[won]], axis=1)
+    faces[g[won]] = np.stack([d[won], b[won], c[won]], axis=1)
+    return len(won), np.concatenate([x[wanted] for x in (a, b, c, d)])
+
+
+def _gain(a: NDArray, b: NDArray, c: NDArray, d: NDArray) -> NDArray[np.float64]:
+    """(N,) how many times better the worse of two triangles gets if (a, b, c) and (b, a, d) become (a, d, c) and
+    (d, b, c); 0 if that changed the surface or turned a triangle over."""
+    old = np.cross(b - a, c - a) + np.cross(a - b, d - b)
+    size = np.linalg.norm(old, axis=1)
+    across = np.cross(b - a, d - c)
+    apart = np.abs(np.sum((c - a) * across, axis=1)) / np.maximum(np.linalg.norm(across, axis=1), 1e-300)
+    same = apart <= FLAT * np.sqrt(size / 2)
+    for x, y, z in ((a, d, c), (d, b, c)):
+        cross = np.cross(y - x, z - x)
+        same &= np.sum(cross * old, axis=1) > 0.5 * np.linalg.norm(cross, axis=1) * size
+    before = np.minimum(quality(a, b, c), quality(b, a, d))
+    return np.where(same, np.minimum(quality(a, d, c), quality(d, b, c)) / np.maximum(before, 1e-12), 0.0)
