@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from appearance_opt import compare, simplify, simplify_options
+from appearance_opt import bake, bake_options, compare, simplify, simplify_options
 from appearance_opt.asset import load, save
 from appearance_opt.asset.origin import settle
 from appearance_opt.asset.types import Asset, Mesh
@@ -186,3 +186,18 @@ def test_a_result_lies_where_the_input_does(tmp_path: Path) -> None:
     assert again.asset.origin == far.origin
     low, high = load(tmp_path / "again.glb").bounds()
     np.testing.assert_allclose((low + high) / 2, PLACE, atol=0.1)
+
+
+def test_a_bake_between_two_origins_is_that_of_one() -> None:
+    high = make_asset(16, 32)
+    low = make_asset(8, 16)
+    maps = []
+    for place, other in ((np.zeros(3), np.zeros(3)), (PLACE, PLACE + (1, 2, -1))):
+        at = [replace(a, origin=tuple(place.tolist())) for a in (high, low)]
+        given = bake_options("draft", closed_form=True, texture_size=32, samples=1, cage=0.1)
+        result = bake(at[0], apart(at[1], other), None, given)
+        assert result.asset.origin == tuple(other.tolist())
+        np.testing.assert_allclose(np.mean(result.asset.bounds(), axis=0), place, atol=0.05)
+        maps.append(result.maps)
+    for name in ("normal_x", "red", "roughness"):
+        np.testing.assert_allclose(maps[1][name], maps[0][name], atol=0.02)
