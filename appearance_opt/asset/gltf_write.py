@@ -16,6 +16,7 @@ from appearance_opt.asset.encoding import encoded_for
 from appearance_opt.asset.gltf_materials import IOR, STRENGTH, TRANSMISSION, VOLUME
 from appearance_opt.asset.height import as_16_bit, height_png
 from appearance_opt.asset.paths import replacing
+from appearance_opt.asset.sides import apart_from_sides
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -73,10 +74,15 @@ class _Writer:
         self._samplers: list[dict[str, int]] = []
         self._pending: list[tuple[Texture, ColorSpace]] = []
         materials: dict[int, int] = {}
+        looks: set[tuple] = set()
         for mesh in asset.meshes:
             if id(mesh.material) not in materials:
                 materials[id(mesh.material)] = len(materials)
-                self.json.setdefault("materials", []).append(self._material(mesh.material))
+                written = self._material(mesh.material)
+                if (look := apart_from_sides(mesh.material)) in looks:
+                    written["name"] += "_double_sided" if mesh.material.double_sided else "_single_sided"
+                looks.add(look)
+                self.json.setdefault("materials", []).append(written)
             self.json["meshes"].append(self._mesh(mesh, materials[id(mesh.material)]))
         with ThreadPoolExecutor() as pool:
             self.image_files = list(pool.map(lambda p: images.encode_png(encoded_for(*p)), self._pending))

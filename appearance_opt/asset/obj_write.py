@@ -12,6 +12,7 @@ from appearance_opt.asset.alpha import coverage, kind_of
 from appearance_opt.asset.encoding import encoded_for
 from appearance_opt.asset.mtl import ALPHA_TEST, WITHOUT_MAP
 from appearance_opt.asset.paths import file_name, replacing
+from appearance_opt.asset.sides import apart_from_sides
 from appearance_opt.asset.types import Texture, linear_to_srgb
 
 if TYPE_CHECKING:
@@ -29,10 +30,11 @@ def save_obj(asset: Asset, path: Path) -> None:
     place for their alpha. What light passes through becomes alpha: of ``alpha.coverage``.
     """
     # the number keeps names apart that are equal, or become so
-    named = {id(m.material): f"{i}_{_word(m.material.name)}" for i, m in enumerate(asset.meshes)}
+    look = {id(m.material): apart_from_sides(m.material) for m in asset.meshes}
+    named = {look[id(m.material)]: f"{i}_{_word(m.material.name)}" for i, m in enumerate(asset.meshes)}
     mtl = ["# appearance-opt"]
-    for m in {id(m.material): m.material for m in asset.meshes}.values():
-        mtl += _mtl_lines(replace(m, name=named[id(m)]), path)
+    for key, m in {look[id(m.material)]: m.material for m in asset.meshes}.items():
+        mtl += _mtl_lines(replace(m, name=named[key]), path)
     with replacing(path.with_suffix(".mtl")) as temporary:
         temporary.write_text("\n".join(mtl) + "\n", encoding="utf-8")
     lines = ["# appearance-opt", f"mtllib {path.stem}.mtl"]
@@ -40,7 +42,7 @@ def save_obj(asset: Asset, path: Path) -> None:
     for mesh in asset.meshes:
         lines += [
             f"o {' '.join(mesh.name.split())}",
-            f"usemtl {named[id(mesh.material)]}",
+            f"usemtl {named[look[id(mesh.material)]]}",
             *_vertices(mesh, asset.origin),
         ]
         # vertices are split at seams: one index serves all that a mesh has

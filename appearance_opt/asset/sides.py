@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -9,11 +10,12 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from appearance_opt.asset.normals import weld
+from appearance_opt.asset.types import Displacement, Texture
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from appearance_opt.asset.types import Mesh
+    from appearance_opt.asset.types import Material, Mesh
 
 THIN = 1e-3
 """Volume over area^1.5 of a closed part, below which it is as good as two sheets back to back: a square plate a 350th
@@ -23,6 +25,13 @@ as thick as it is wide. A ball has 0.094."""
 def single_sided(meshes: tuple[Mesh, ...]) -> NDArray[np.bool_]:
     """(F,) faces of all meshes, one mesh after the other, that are seen from their front only."""
     return np.repeat([not m.material.double_sided for m in meshes], [len(m.faces) for m in meshes])
+
+
+def apart_from_sides(material: Material) -> tuple:
+    """Equal for materials with equal values and the same textures, whatever the sides: formats whose materials do not
+    know of sides need one for them all."""
+    values = (getattr(material, f.name) for f in fields(material) if f.name != "double_sided")
+    return tuple(id(v) if isinstance(v, Texture | Displacement) else v for v in values)
 
 
 def culled(

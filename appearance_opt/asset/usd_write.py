@@ -15,6 +15,7 @@ from appearance_opt.asset.alpha import coverage, kind_of
 from appearance_opt.asset.encoding import encoded_for
 from appearance_opt.asset.height import as_16_bit, height_png
 from appearance_opt.asset.paths import MAX_NAME, replacing
+from appearance_opt.asset.sides import apart_from_sides
 
 if TYPE_CHECKING:
     from appearance_opt.asset.types import Asset, ColorSpace, Material, Mesh, Texture
@@ -69,9 +70,9 @@ def _write_stage(asset: Asset, root: Path, textures: str) -> None:
     if any(asset.origin):
         top.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Vec3d(*asset.origin))
     UsdGeom.Scope.Define(stage, f"/{name}/Materials")
-    materials: dict[tuple[int, bool, bool], Any] = {}
+    materials: dict[tuple[tuple, bool, bool], Any] = {}
     for k, mesh in enumerate(asset.meshes):
-        key = (id(mesh.material), _colored(mesh), _veiled(mesh))
+        key = (apart_from_sides(mesh.material), _colored(mesh), _veiled(mesh))
         if key not in materials:
             word = Tf.MakeValidIdentifier(mesh.material.name)[:MAX_NAME]
             target = f"/{name}/Materials/M{len(materials)}_{word}"

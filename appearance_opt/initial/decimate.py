@@ -91,7 +91,7 @@ def decimate_with_source(
     kept, weight, sides = without_stacks(p, f[source], weight[source], single[source])
     source = source[kept]
     f = f[source]
-    state = State(p, vertex_quadrics(p, f, weight, sides), f, source, single)
+    state = State(p, vertex_quadrics(p, f, weight, sides, single[source]), f, source, single)
     for freedom in (STRICT, TURNING):
         state.blocked = state.blocked[:0]
         while len(state.faces) > triangles and (price := _round(state, triangles, freedom)) is not None:
@@ -109,7 +109,9 @@ def decimate_with_source(
     return state.positions[used] * scale + centre, compact.reshape(-1, 3).astype(np.int32), state.source
 
 
-def vertex_quadrics(positions: NDArray, faces: NDArray, importance: NDArray, sides: Sides) -> NDArray:
+def vertex_quadrics(
+    positions: NDArray, faces: NDArray, importance: NDArray, sides: Sides, single_sided: NDArray
+) -> NDArray:
     """(V, 10): planes of the faces around each vertex, planes that hold boundaries, original points."""
     p0, p1, p2 = (positions[faces[:, k]] for k in range(3))
     cross = np.cross(p1 - p0, p2 - p0)
@@ -121,16 +123,25 @@ def vertex_quadrics(positions: NDArray, faces: NDArray, importance: NDArray, sid
     for k in range(3):
         accumulate(total, faces[:, k], q)
         accumulate(share, faces[:, k], weight[:, None])
-    _add_boundaries(total, positions, faces, unit(cross), importance, sides)
+    _add_boundaries(total, positions, faces, unit(cross), importance, sides, single_sided)
     return total + quadrics.of_points(positions, POINT_WEIGHT * share[:, 0])
 
 
 def _add_boundaries(
-    total: NDArray, positions: NDArray, faces: NDArray, normals: NDArray, importance: NDArray, sides: Sides
+    total: NDArray,
+    positions: NDArray,
+    faces: NDArray,
+    normals: NDArray,
+    importance: NDArray,
+    sides: Sides,
+    single_sided: NDArray,
 ) -> None:
-    """Planes through the edges whose faces all have the same corners: one face, or the two sides of a sheet."""
+    """Planes through the edges whose faces all have the same corners (one face, or the two sides of a sheet), and
+    through those between faces that are seen from one side and from both."""
     start, end, opposite = sides.corners(faces)
     alone = np.minimum.reduceat(opposite, sides.start) == np.maximum.reduceat(opposite, sides.start)
+    one_way = single_sided[sides.face]
+    alone |= np.logical_and.reduceat(one_way, sides.start) != np.logical_or.reduceat(one_way, sides.start)
     open_ = np.flatnonzero(np.repeat(alone, sides.uses))
     if not len(open_):
         return

@@ -53,8 +53,7 @@ def _by_side(mesh: Mesh, single: NDArray[np.bool_] | None) -> tuple[Mesh, ...]:
     one_way = replace(mesh.material, double_sided=False)
     if single.all():
         return (replace(mesh, material=one_way),)
-    one_way = replace(one_way, name=f"{mesh.name}_single_sided")
-    return _part(mesh, ~single), replace(_part(mesh, single), material=one_way, name=one_way.name)
+    return _part(mesh, ~single), replace(_part(mesh, single), material=one_way, name=f"{mesh.name}_single_sided")
 
 
 def _part(mesh: Mesh, faces: NDArray[np.bool_]) -> Mesh:
