@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from appearance_opt.asset import images, load, uv_frames
+from appearance_opt.asset import images, load, mtl, uv_frames
 from appearance_opt.asset.budget import BYTES, Budget
 from appearance_opt.asset.companions import Companions
 from appearance_opt.asset.polygons import MOST_CORNERS, Polygons, triangulate
@@ -137,6 +137,18 @@ def test_resampled_textures_have_a_bound_together(ball: Asset, monkeypatch: pyte
     notes: list[str] = []
     uv_frames.unified(meshes, frames, notes.append)
     assert [("too large" in n) for n in notes] == [False, True, True]
+
+
+def test_a_material_file_named_again_is_read_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "x.mtl").write_text("newmtl m\nKd 1 0 0\n")
+    (tmp_path / "x.obj").write_text("mtllib x.mtl\n" * 9 + "v 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl m\nf 1 2 3\n")
+    made: list[str] = []
+    whole = mtl.MaterialReader._material
+    monkeypatch.setattr(
+        mtl.MaterialReader, "_material", lambda self, name, *rest: made.append(name) or whole(self, name, *rest)
+    )
+    assert load(tmp_path / "x.obj").meshes[0].material.base_color == (1.0, 0.0, 0.0)
+    assert made == ["m"]
 
 
 def test_faces_too_thin_or_small_for_the_unwrapper_have_charts_of_their_own() -> None:

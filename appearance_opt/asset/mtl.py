@@ -78,9 +78,13 @@ class MaterialReader:
         self.by_name: dict[str, Material] = {}
         self.frames: dict[int, dict[str, uv_frames.Frame]] = {}
         self.tiles: dict[int, Callable[[Tile], Material]] = {}
+        self._files: set[Path] = set()
 
     def read(self, path: Path) -> None:
-        """Add the materials of a file. Raises InputError."""
+        """Add the materials of a file, once. Raises InputError."""
+        if path in self._files:
+            return
+        self._files.add(path)
         statements: dict[str, dict[str, str]] = {}
         current: dict[str, str] = {}
         for line in read_text(path).splitlines():
