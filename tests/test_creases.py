@@ -11,7 +11,8 @@ import trimesh
 
 from appearance_opt import bake_options, compare, simplify_options
 from appearance_opt.asset import load
-from appearance_opt.asset.creases import Edges, shaded, smooth_by_angle, split
+from appearance_opt.asset.creases import shaded, smooth_by_angle, split
+from appearance_opt.asset.edges import Edges
 from appearance_opt.asset.normals import unit, vertex_normals
 from appearance_opt.asset.types import Asset, Mesh, srgb_to_linear
 from appearance_opt.baking.low import movable, unwrapped
@@ -224,7 +225,7 @@ def test_hard_edges_do_not_tear_a_mesh() -> None:
 def test_one_hard_edge_that_ends_within_a_surface_splits_nothing() -> None:
     ball = trimesh.creation.icosphere(2)
     p, f = ball.vertices, ball.faces.astype(np.int32)
-    edges = Edges.of(f, len(p))
+    edges = Edges.of(p, f)
     assert len(edges.ends) == 3 * len(f) / 2  # closed
     smooth = np.ones(len(edges.ends), bool)
     smooth[40] = False
@@ -237,18 +238,37 @@ def test_edges_join_only_faces_that_run_along_them_in_opposite_directions() -> N
     """Three faces at one edge, of which two look alike, and one that is turned over."""
     p = np.array([(0, 0, 0), (0, 1, 0), (1, 0, 0), (-1, 0, 0), (0, 0, 1)], np.float32)
     faces = np.array([(0, 2, 1), (0, 1, 3), (0, 1, 4)])
-    edges = Edges.of(faces, len(p))
+    edges = Edges.of(p, faces)
     assert len(edges.ends) == 1
     assert sorted(edges.faces[0]) == [0, 1]
     for corner, end in zip(edges.corners[0], edges.ends[0], strict=True):
         assert faces.ravel()[corner].tolist() == [end, end]
-    assert not len(Edges.of(np.array([(0, 1, 2), (0, 1, 3)]), 4).ends)
+    assert not len(Edges.of(p, np.array([(0, 1, 2), (0, 1, 3)])).ends)
     (mesh,) = shaded([Mesh(p, faces.astype(np.int32))])
     assert np.isfinite(mesh.normals).all()
     # a face without area divides its neighbours from itself alone
     flat = np.array([(0, 0, 0), (2, 0, 0), (1, 0, 0), (1, 1, 0), (1, -1, 0)], np.float32)
     (mesh,) = shaded([Mesh(flat, np.array([(0, 2, 3), (2, 1, 3), (0, 1, 2), (0, 4, 1)], np.int32))])
     np.testing.assert_allclose(mesh.normals[mesh.faces[[0, 1, 3]]], np.tile((0, 0, 1), (3, 3, 1)), atol=1e-6)
+
+
+@pytest.mark.parametrize("statement", ["s 1\n", ""])
+def test_the_sides_of_a_sheet_are_smooth_each(tmp_path: Path, statement: str) -> None:
+    """Many OBJ files have each face twice, once for each side, over the same vertices."""
+    angle = np.radians(np.arange(0, 181, 15))
+    points = np.array([(np.sin(a), y, np.cos(a)) for y in (0.0, 1.0, 2.0) for a in angle])
+    n = len(angle)
+    quads = [(k + r, k + 1 + r, k + 1 + r + n, k + r + n) for r in (0, n) for k in range(n - 1)]
+    lines = [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in points.tolist()] + [statement]
+    lines += ["f " + " ".join(str(i + 1) for i in q[::way]) for q in quads for way in (1, -1)]
+    (tmp_path / "x.obj").write_text("\n".join(lines) + "\n")
+    mesh = load(tmp_path / "x.obj").meshes[0]
+    assert len(mesh.positions) == 2 * len(points)
+    radial = unit(mesh.positions.astype(np.float64) * (1, 0, 1))
+    inner = np.abs(mesh.positions[:, 2]) < np.cos(np.radians(10))  # at both ends there is half a fan only
+    assert (np.abs(np.sum(mesh.normals * radial, axis=1))[inner] > np.cos(np.radians(1))).all()
+    own = face_normals(mesh)
+    assert (np.einsum("fkc,fc->fk", mesh.normals[mesh.faces], own) > np.cos(np.radians(10))).all()
 
 
 def test_other_attributes_go_with_the_vertices() -> None:

@@ -7,7 +7,6 @@ edges; vertices are split where there are several such sets.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,7 +15,8 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from appearance_opt.asset.batch import Batch, in_range
-from appearance_opt.asset.normals import split_where_cancelled, summed_normals, unit, weld
+from appearance_opt.asset.edges import Edges
+from appearance_opt.asset.normals import split_where_cancelled, summed_normals, weld
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -36,46 +36,16 @@ LOOSE_ENDS = 3
 """How often the loose ends of creases are taken off: in noise, what is left is short. Creases of CAD
 parts end at borders and other creases."""
 
+FOLDED = np.cos(np.radians(179.0))
+"""Cosine of the angle from which on faces lie back to back: the rim of a sheet that is modelled with two
+sides is never smooth, for their normals cancel."""
+
 FLAT = np.radians(1.0)
 """Angles up to about this count as flat: rounded coordinates bend planes by less."""
 
 TYPICAL = 1.2
 """Of angles that are normally distributed the geometric mean is 0.53 deviations. So many times that is
 about what their mean size is after they have partly cancelled each other."""
-
-
-@dataclass(frozen=True)
-class Edges:
-    """Where two faces meet that run along an edge in opposite directions, as those of one surface do.
-
-    ``ends`` (E, 2): numbers of its vertices; ``faces`` (E, 2); ``corners`` (E, 2, 2): for both ends, the
-    corners (3 * face + number) of the two faces there. Of edges of more than two faces, each face
-    occurs once at most.
-    """
-
-    ends: NDArray[np.int64]
-    faces: NDArray[np.int64]
-    corners: NDArray[np.int64]
-
-    @classmethod
-    def of(cls, faces: NDArray, vertices: int) -> Edges:
-        """Those of ``faces`` (F, 3), whose corners refer to ``vertices`` places."""
-        start = np.asarray(faces, np.int64).ravel()
-        end = np.roll(faces, -1, axis=1).astype(np.int64).ravel()
-        key = np.minimum(start, end) * vertices + np.maximum(start, end)
-        forward, backward = np.flatnonzero(start < end), np.flatnonzero(start > end)
-        forward = forward[np.argsort(key[forward], kind="stable")]
-        backward = backward[np.argsort(key[backward], kind="stable")]
-        first, second = key[forward], key[backward]
-        # the k-th face that runs along an edge one way meets the k-th that runs the other way
-        rank = np.arange(len(first)) - np.searchsorted(first, first)
-        match = np.searchsorted(second, first) + rank
-        paired = match < len(second)
-        paired[paired] = second[match[paired]] == first[paired]
-        a, b = forward[paired], backward[match[paired]]
-        after_a, after_b = a // 3 * 3 + (a + 1) % 3, b // 3 * 3 + (b + 1) % 3
-        corners = np.stack([np.stack([a, after_b], axis=1), np.stack([after_a, b], axis=1)], axis=1)
-        return cls(np.stack([start[a], end[a]], axis=1), np.stack([a // 3, b // 3], axis=1), corners)
 
 
 def smooth_by_angle(
@@ -89,21 +59,19 @@ def smooth_by_angle(
     smooth. The loose ends of what is left are smooth as well (``LOOSE_ENDS``). ``faces``: of places, see
     ``Edges``."""
     p = np.asarray(positions, np.float64)
-    a, b, c = (p[faces[:, k]] for k in range(3))
-    normal = unit(np.cross(b - a, c - a))
-    one, other = (normal[edges.faces[:, k]] for k in (0, 1))
-    cosine = np.clip(np.sum(one * other, axis=1), -1, 1)
     if crease_angle is not None:
-        return cosine >= np.cos(np.radians(crease_angle))
-    smooth = cosine >= np.cos(SHARP)
+        return edges.cosine >= max(np.cos(np.radians(crease_angle)), FOLDED)
+    smooth = edges.cosine >= np.cos(SHARP)
     sharp = np.flatnonzero(~smooth)
     if not len(sharp):
         return smooth
-    angle = np.arccos(cosine)
+    angle = np.arccos(edges.cosine)
+    one, other = (edges.normals[edges.faces[:, k]] for k in (0, 1))
     apex = faces[edges.faces[:, 1]].sum(axis=1) - edges.ends.sum(axis=1)
     concave = np.sum(one * (p[apex] - p[edges.ends[:, 0]]), axis=1) > 0
-    flat = np.any(one, axis=1) & np.any(other, axis=1)  # a face without area is no noise
-    bend = np.where(flat, np.where(concave, -angle, angle), 0)
+    # faces without area, and the rims of sheets, are no noise
+    known = np.any(one, axis=1) & np.any(other, axis=1) & (edges.cosine >= FOLDED)
+    bend = np.where(known, np.where(concave, -angle, angle), 0)
     rough = roughness(faces, edges, bend, len(p))[edges.ends[sharp]].min(axis=1)
     sharp = sharp[angle[sharp] > NOISE_FACTOR * rough]
     uses = np.bincount(edges.ends.ravel(), minlength=len(p))
@@ -132,7 +100,7 @@ def shaded(
     positions = batch.joined("positions")
     first, place = weld(positions)
     faces = place[batch.faces]
-    edges = Edges.of(faces, len(first))
+    edges = Edges.of(positions[first], faces)
     if groups is None:
         smooth = smooth_by_angle(positions[first], faces, edges, crease_angle)
     else:
@@ -169,9 +137,9 @@ def roughness(faces: NDArray, edges: Edges, bend: NDArray, vertices: int) -> NDA
 
 
 def smooth_by_group(groups: NDArray, edges: Edges) -> NDArray[np.bool_]:
-    """(E,) edges within one smoothing group, of ``groups`` (F,); 0 is none."""
+    """(E,) edges within one smoothing group, of ``groups`` (F,), 0 for none; but not the rims of sheets."""
     one, other = groups[edges.faces].T
-    return (one == other) & (one != 0)
+    return (one == other) & (one != 0) & (edges.cosine >= FOLDED)
 
 
 def split(
@@ -185,9 +153,9 @@ def split(
     places, vertices = int(place.max(initial=-1)) + 1, len(positions)
     corner, corner_place = faces.ravel().astype(np.int64), place[faces].ravel().astype(np.int64)
     # an edge of a single face is hard as well, but it ends a fan by itself: only where another hard
-    # edge meets it are there two sets
+    # edge meets it, or where surfaces pass through each other, are there two sets
     torn = np.zeros(places, bool)
-    torn[edges.ends[~smooth]] = True
+    torn[edges.ends[~smooth | edges.several]] = True
     at = np.flatnonzero(torn[corner_place])
     number = np.full(len(corner), -1)
     number[at] = np.arange(len(at))
