@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from appearance_opt.errors import AppearanceError, BackendError, DivergedError, InputError, ReferenceRenderError
     from appearance_opt.jobs.bake import bake
     from appearance_opt.jobs.compare import compare
+    from appearance_opt.jobs.inspect import inspect
     from appearance_opt.jobs.joint import joint
     from appearance_opt.jobs.simplify import simplify
 
@@ -26,6 +27,7 @@ _HOMES = {
     "bake": "appearance_opt.jobs.bake",
     "bake_options": "appearance_opt.config",
     "compare": "appearance_opt.jobs.compare",
+    "inspect": "appearance_opt.jobs.inspect",
     "joint": "appearance_opt.jobs.joint",
     "load": "appearance_opt.asset",
     "save": "appearance_opt.asset",
@@ -44,6 +46,7 @@ __all__ = [
     "bake",
     "bake_options",
     "compare",
+    "inspect",
     "joint",
     "load",
     "save",

@@ -360,35 +360,22 @@ def inspect(
     crease_angle: CreaseAngleOption = None,
     variant: Annotated[list[str] | None, typer.Option(help=VARIANT)] = None,
 ) -> None:
-    """Say what is in an asset and what is wrong with it."""
-    from dataclasses import asdict
+    """Say what is in an asset, what is wrong with it, and what simplify will do with each material."""
+    from appearance_opt.jobs.inspect import inspect as run
 
-    from appearance_opt.asset import load
-    from appearance_opt.asset.alpha import counted
-    from appearance_opt.asset.validate import inspected
-
-    given = {
-        "variants": _variants(variant),
-        "missing_textures": missing_textures,
-        "root": root,
-        "crease_angle": crease_angle,
-    }
-    asset = load(source, refine=refine, mend=False, **given)  # type: ignore[arg-type]
-    counts, asset = inspected(asset, str(source))
-    alpha = {kind: asdict(share) for kind, share in counted(asset).items()}
-    found = {"meshes": len(asset.meshes), **asdict(counts), "alpha": alpha, "notes": list(asset.notes)}
+    found = run(
+        source,
+        refine=refine,
+        variants=_variants(variant),
+        missing_textures=missing_textures,  # type: ignore[arg-type]
+        root=root,
+    )
     if as_json:
         import json
 
-        print(json.dumps(found, indent=1))
+        print(json.dumps(found.record(), indent=1))
         return
-    for name, value in found.items():
-        if name not in ("alpha", "notes"):
-            print(f"{name.replace('_', ' '):22} {value}")
-    for kind, share in alpha.items():
-        print(f"{kind:22} {share['meshes']} meshes, {share['triangles']} triangles: {share['becomes']}")
-    for note in asset.notes:
-        print(f"note: {note}")
+    print("\n".join(found.lines()))
 
 
 @app.command()

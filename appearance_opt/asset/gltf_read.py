@@ -12,13 +12,13 @@ from appearance_opt.asset import uv_frames
 from appearance_opt.asset.batch import Batch, in_range, replaced
 from appearance_opt.asset.gltf_accessors import Document
 from appearance_opt.asset.gltf_draco import DRACO, Compressed
-from appearance_opt.asset.gltf_materials import READ_EXTENSIONS, MaterialReader
+from appearance_opt.asset.gltf_materials import READ_EXTENSIONS, VARIANTS, MaterialReader
 from appearance_opt.asset.gltf_meshopt import MESHOPT
 from appearance_opt.asset.gltf_nodes import INSTANCING, Nodes
 from appearance_opt.asset.normals import unit
 from appearance_opt.asset.origin import settle
 from appearance_opt.asset.placement import placed
-from appearance_opt.asset.types import Asset, Mesh
+from appearance_opt.asset.types import Asset, Contents, Mesh
 from appearance_opt.errors import InputError
 
 if TYPE_CHECKING:
@@ -69,7 +69,19 @@ class _Reader:
         if not self.keep_layout:
             meshes = self._flat_where_needed(meshes)
         meshes = self.materials.in_one_frame(meshes, self.keep_layout)
-        return Asset(tuple(meshes), self.path.stem, self.document.companions.notes.lines(), origin=origin)
+        notes = self.document.companions.notes.lines()
+        return Asset(tuple(meshes), self.path.stem, notes, origin=origin, contents=self._contents())
+
+    def _contents(self) -> Contents:
+        def names(items: list[dict[str, Any]], kind: str) -> tuple[str, ...]:
+            return tuple(str(item.get("name", f"{kind}{k}")) for k, item in enumerate(items))
+
+        variants = self.document.extension(VARIANTS).get("variants", [])
+        return Contents(
+            names(self.document.items("skins"), "skin"),
+            names(self.document.items("animations"), "animation"),
+            names(variants, "variant"),
+        )
 
     def _roots(self) -> list[int]:
         """The nodes at the top of what is drawn: those of the scene that the file names, else of the

@@ -144,6 +144,16 @@ class Mesh:
 
 
 @dataclass(frozen=True)
+class Contents:
+    """Names of what a file holds beside its surfaces, and no job here uses: ``skins`` (in USD skeletons), ``clips`` of
+    animation, ``variants`` as ``--variant`` takes them."""
+
+    skins: tuple[str, ...] = ()
+    clips: tuple[str, ...] = ()
+    variants: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
 class Asset:
     """All meshes of one file, node transforms applied. ``notes`` lists, one line each, what the
     loader dropped, repaired or assumed; ``files``, absolute paths of the files that it refers to;
@@ -155,6 +165,7 @@ class Asset:
     notes: tuple[str, ...] = ()
     files: tuple[Path, ...] = ()
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    contents: Contents = field(default_factory=Contents)
 
     @property
     def triangle_count(self) -> int:

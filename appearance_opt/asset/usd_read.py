@@ -21,7 +21,7 @@ from appearance_opt.asset.placement import Placement, placed
 from appearance_opt.asset.polygons import Polygons, triangulate
 from appearance_opt.asset.rows import ranked, unique_rows
 from appearance_opt.asset.subdivide import Sharpness, catmull_clark
-from appearance_opt.asset.types import Asset, Mesh
+from appearance_opt.asset.types import Asset, Contents, Mesh
 from appearance_opt.asset.usd_guard import check_usd
 from appearance_opt.asset.usd_materials import MaterialReader
 from appearance_opt.errors import InputError
@@ -101,13 +101,15 @@ def _refuse_escapes(stage: Any, path: Path, companions: Companions) -> None:
     for layer in stage.GetUsedLayers():
         if layer.anonymous or not layer.realPath:
             continue
+        file = Path(layer.realPath.split("[")[0])
         try:
-            check_inside(Path(layer.realPath.split("[")[0]), path, layer.identifier, companions.root)
+            check_inside(file, path, layer.identifier, companions.root)
         except InputError:
             raise InputError(
                 f"{path}: refers to '{layer.identifier}' and files in other folders than its own; allow the folder: "
                 f"--root {_folder_of_all(stage, path, companions.root)}"
             ) from None
+        companions.files.append(file.resolve())
 
 
 def _folder_of_all(stage: Any, path: Path, root: Path | None) -> Path:
@@ -189,7 +191,22 @@ class _Reader:
                 meshes += [self._put(part, place) for part in self._parts(prim)]
         meshes = self.materials.in_one_frame(meshes, self.keep_layout)
         meshes, origin = settle(meshes, self.note)
-        return Asset(tuple(meshes), self.path.stem, self.companions.notes.lines(), origin=origin)
+        notes = self.companions.notes.lines()
+        return Asset(tuple(meshes), self.path.stem, notes, origin=origin, contents=self._contents())
+
+    def _contents(self) -> Contents:
+        """Skeletons, animations of theirs or the frames of the stage, and the variants of the default prim."""
+        found: dict[str, list[str]] = {"Skeleton": [], "SkelAnimation": []}
+        for prim in self.stage.Traverse():
+            if prim.GetTypeName() in found:
+                found[prim.GetTypeName()].append(str(prim.GetName()))
+        clips, stage = found["SkelAnimation"], self.stage
+        if not clips and stage.HasAuthoredTimeCodeRange() and stage.GetEndTimeCode() > stage.GetStartTimeCode():
+            clips = [f"frames {stage.GetStartTimeCode():g} to {stage.GetEndTimeCode():g}"]
+        top = stage.GetDefaultPrim()
+        sets = [top.GetVariantSet(name) for name in top.GetVariantSets().GetNames()] if top else []
+        variants = [f"{s.GetName()}={choice}" for s in sets for choice in s.GetVariantNames()]
+        return Contents(tuple(found["Skeleton"]), tuple(clips), tuple(variants))
 
     def _to_world(self, prim: Any) -> Any:
         """From a mesh's own frame to the world. A skinned one is kept at its bind pose, where its own transform does

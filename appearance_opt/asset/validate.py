@@ -53,6 +53,8 @@ class Validation:
     boundary_edges: int = 0
     non_manifold_edges: int = 0
     connected_parts: int = 0
+    reversed_normals: int = 0
+    """Faces whose winding disagrees with the normals of their vertices."""
 
 
 def inspected(asset: Asset, path: str) -> tuple[Validation, Asset]:
@@ -94,7 +96,20 @@ def validate(asset: Asset) -> Validation:
         boundary_edges=int((uses == 1).sum()),
         non_manifold_edges=int((uses > 2).sum()),
         connected_parts=_parts(edges, welded, len(first)),
+        reversed_normals=_reversed(batch, faces),
     )
+
+
+def _reversed(batch: Batch, faces: NDArray) -> int:
+    if not batch.have("normals").any():
+        return 0
+    positions, normals, count = batch.joined("positions"), batch.joined("normals"), 0
+    for start in range(0, len(faces), BAND):
+        corners = faces[start : start + BAND].T
+        (a, b, c), summed = positions[corners].astype(np.float64), normals[corners].sum(axis=0)
+        with np.errstate(invalid="ignore", over="ignore"):
+            count += int((np.sum(np.cross(b - a, c - a) * summed, axis=1) < 0).sum())
+    return count
 
 
 def _counted(edges: NDArray, vertices: int) -> tuple[NDArray, NDArray]:

@@ -1,0 +1,218 @@
+"""What is in a file: for an artist who wants to know before a long run."""
+
+from __future__ import annotations
+
+import textwrap
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from appearance_opt.asset import load
+from appearance_opt.asset.alpha import FITTED, KEPT, Share, counted, kind_of, settled
+from appearance_opt.asset.types import Contents, Texture
+from appearance_opt.asset.validate import Validation, inspected
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from appearance_opt.asset.companions import MissingTextures
+    from appearance_opt.asset.types import Asset, Material, Mesh
+
+LISTED = 12
+"""Materials that are told one by one, those of the most triangles; names of anything else."""
+
+COLUMNS = 80
+
+MAPS = {
+    "base_color_texture": "base colour",
+    "orm_texture": "roughness/metalness",
+    "normal_texture": "normal",
+    "emission_texture": "emission",
+    "transmission_texture": "transmission",
+    "thickness_texture": "thickness",
+}
+"""Textures of a material, and what they are called."""
+
+
+@dataclass(frozen=True)
+class MapFacts:
+    """A texture in its place: pixels, numbers per pixel and bits of each, "srgb" or "linear"."""
+
+    map: str
+    width: int
+    height: int
+    channels: int
+    bits: int
+    color_space: str
+
+
+@dataclass(frozen=True)
+class MaterialFacts:
+    """``seen``: opaque, mask, blend or transmission; ``simplify``: what it does with the meshes that wear it."""
+
+    name: str
+    meshes: int
+    triangles: int
+    seen: str
+    double_sided: bool
+    simplify: str
+    maps: tuple[MapFacts, ...]
+
+
+@dataclass(frozen=True)
+class Inspection:
+    """``size``: extent along x, y, z in metres; ``origin``: see ``Asset``; ``file_bytes``: of the ``files`` that the
+    asset is made of; ``texture_bytes``: of their pixels as they are stored here, uncompressed, without mip levels."""
+
+    name: str
+    files: int
+    file_bytes: int
+    size: tuple[float, float, float]
+    origin: tuple[float, float, float]
+    meshes: int
+    vertices: int
+    counts: Validation
+    materials: tuple[MaterialFacts, ...]
+    textures: int
+    texture_bytes: int
+    contents: Contents
+    alpha: dict[str, Share]
+    notes: tuple[str, ...]
+
+    def record(self) -> dict[str, Any]:
+        """All of it for JSON, the counts and contents among the rest."""
+        out = asdict(self)
+        return {**out, **out.pop("counts"), **out.pop("contents")}
+
+    def lines(self) -> list[str]:
+        """The same for a terminal; long lists end in a count."""
+        x, y, z = (f"{s:.4g}" for s in self.size)
+        out = [
+            f"file        {self.name}, {_bytes(self.file_bytes)}{_of(self.files, 'files')}",
+            f"size        {x} x {y} x {z} m",
+            f"triangles   {self.counts.triangles:,} in {_some(self.meshes, 'mesh', 'meshes')}, "
+            f"{self.vertices:,} vertices, {_some(self.counts.connected_parts, 'connected part')}",
+            f"textures    {self.textures}, {_bytes(self.texture_bytes)} uncompressed",
+        ]
+        for what, names in (("skins", self.contents.skins), ("clips", self.contents.clips)):
+            out += _listed(f"{what:12}", names, f"{len(names)}: ") if names else []
+        out += _listed(f"{'variants':12}", self.contents.variants) if self.contents.variants else []
+        if any(self.origin):
+            out.append("far away    its middle is near ({:.10g}, {:.10g}, {:.10g}) m".format(*self.origin))
+        faults = {k: v for k, v in asdict(self.counts).items() if v and k not in ("triangles", "connected_parts")}
+        out.append(f"to look at  {'' if faults else 'nothing'}".rstrip())
+        out += [f"  {name.replace('_', ' '):24}{count:,}" for name, count in faults.items()]
+        out.append("simplify")
+        out += [f"  {kind:24}{s.triangles:,} triangles: {s.becomes}" for kind, s in self.alpha.items()]
+        out.append(f"materials   {len(self.materials):,}")
+        for material in self.materials[:LISTED]:
+            out += _material_lines(material)
+        if len(self.materials) > LISTED:
+            rest = self.materials[LISTED:]
+            out.append(f"... and {len(rest):,} more, of {sum(m.triangles for m in rest):,} triangles")
+        return out + [f"note: {note}" for note in self.notes]
+
+
+def inspect(
+    source: str | Path,
+    *,
+    refine: int = 1,
+    variants: dict[str, str] | None = None,
+    missing_textures: MissingTextures = "error",
+    root: str | Path | None = None,
+) -> Inspection:
+    """What is in a file, and what is wrong with it. The options are those of ``load``. Raises InputError."""
+    given = load(source, refine=refine, variants=variants, missing_textures=missing_textures, root=root, mend=False)
+    counts, asset = inspected(given, str(source))
+    low, high = asset.bounds()
+    parts = settled(asset)
+    textures = _textures({id(m.material): m.material for m in asset.meshes}.values())
+    files = [file for file in dict.fromkeys(asset.files) if file.is_file()]
+    x, y, z = (float(s) for s in high - low)
+    return Inspection(
+        name=Path(source).name,
+        files=len(files),
+        file_bytes=sum(file.stat().st_size for file in files),
+        size=(x, y, z),
+        origin=asset.origin,
+        meshes=len(asset.meshes),
+        vertices=sum(len(m.positions) for m in asset.meshes),
+        counts=counts,
+        materials=_materials(parts),
+        textures=len(textures),
+        texture_bytes=sum(t.nbytes for t in textures),
+        contents=asset.contents,
+        alpha={str(kind): share for kind, share in counted(parts).items()},
+        notes=parts.notes,
+    )
+
+
+def _textures(materials: Any) -> list[np.ndarray]:
+    """The pixels of all textures, each once."""
+    every = (getattr(m, name) for m in materials for name in MAPS)
+    return list({id(t.pixels): t.pixels for t in every if t is not None}.values())
+
+
+def _materials(asset: Asset) -> tuple[MaterialFacts, ...]:
+    """The materials in the order of their triangles."""
+    wearers: dict[int, list[Mesh]] = {}
+    for mesh in asset.meshes:
+        wearers.setdefault(id(mesh.material), []).append(mesh)
+    facts = [_facts(meshes[0].material, meshes) for meshes in wearers.values()]
+    return tuple(sorted(facts, key=lambda m: -m.triangles))
+
+
+def _facts(material: Material, meshes: Sequence[Mesh]) -> MaterialFacts:
+    kind = kind_of(material)
+    given = ((name, getattr(material, name)) for name in MAPS)
+    return MaterialFacts(
+        name=material.name,
+        meshes=len(meshes),
+        triangles=sum(len(m.faces) for m in meshes),
+        seen=kind,
+        double_sided=material.double_sided,
+        simplify=FITTED if kind == "opaque" else KEPT,
+        maps=tuple(_map_facts(MAPS[name], texture) for name, texture in given if texture is not None),
+    )
+
+
+def _map_facts(name: str, texture: Texture) -> MapFacts:
+    height, width, channels = texture.pixels.shape
+    return MapFacts(name, width, height, channels, 8 * texture.pixels.itemsize, texture.color_space)
+
+
+def _material_lines(m: MaterialFacts) -> list[str]:
+    sides = "both sides" if m.double_sided else "one side"
+    worn = "" if m.meshes == 1 else f" in {m.meshes:,} meshes"
+    head = f"'{m.name}': {m.triangles:,} triangles{worn}, {m.seen}, {sides}; {m.simplify}"
+    spaces = {"srgb": "sRGB", "linear": "linear"}
+    maps = [f"{t.map} {t.width} x {t.height}, {t.bits} bit, {spaces[t.color_space]}" for t in m.maps]
+    return [*_wrapped("  ", head), *(line for text in maps for line in _wrapped("      ", text))]
+
+
+def _listed(head: str, names: Sequence[str], count: str = "") -> list[str]:
+    more = f" and {len(names) - LISTED} more" if len(names) > LISTED else ""
+    return _wrapped(head, count + ", ".join(names[:LISTED]) + more)
+
+
+def _wrapped(head: str, text: str) -> list[str]:
+    return textwrap.wrap(text, COLUMNS, initial_indent=head, subsequent_indent=" " * max(len(head), 6))
+
+
+def _some(count: int, one: str, many: str = "") -> str:
+    return f"{count:,} {one if count == 1 else many or one + 's'}"
+
+
+def _of(count: int, what: str) -> str:
+    return f" in {count} {what}" if count != 1 else ""
+
+
+def _bytes(count: int) -> str:
+    size, unit = float(count), "B"
+    for larger in ("KiB", "MiB", "GiB"):
+        if size < 1024:
+            break
+        size, unit = size / 1024, larger
+    return f"{size:.3g} {unit}" if size < 1000 else f"{size:.0f} {unit}"
