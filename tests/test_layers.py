@@ -161,6 +161,13 @@ def test_nothing_is_not_like_nothing() -> None:
         compare_images(empty, empty)
 
 
+def test_what_pictures_do_not_show_is_noted() -> None:
+    glass, pane = (Asset((card(0, Material("m", **how)),)) for how in ({"transmission": 0.5}, {"opacity": 0.5}))
+    told = compare(glass, pane, views=1, resolution=32).notes
+    assert [n for n in told if n.startswith("transmission is drawn like blended alpha")]
+    assert compare(pane, pane, views=1, resolution=32).notes == ()
+
+
 def test_views_that_show_nothing_do_not_count() -> None:
     reference, candidate = np.zeros((2, 2, 16, 16, 4), np.float32)
     reference[0, 4:12, 4:12] = 1

@@ -162,7 +162,7 @@ def listed(names: Iterable[str]) -> str:
 class _Tests:
     """Looks each texture up once."""
 
-    _sums: dict[tuple[int, float], NDArray[np.int64] | None] = field(default_factory=dict)
+    _sums: dict[tuple[int, float], NDArray[np.int32] | None] = field(default_factory=dict)
 
     def opaque(self, mesh: Mesh) -> NDArray[np.bool_]:
         """(F,) faces that light does not pass."""
@@ -183,7 +183,7 @@ class _Tests:
         sums = self._below(texture, needed / float(least[enough].min()))
         return enough if sums is None else enough & (_counts(sums, mesh, texture) == 0)
 
-    def _below(self, texture: Texture, needed: float) -> NDArray[np.int64] | None:
+    def _below(self, texture: Texture, needed: float) -> NDArray[np.int32] | None:
         """(H + 1, W + 1) numbers of texels with less alpha than ``needed`` above and left of each corner of the grid;
         None if there are none at all."""
         key = id(texture), needed
@@ -193,13 +193,14 @@ class _Tests:
             below = alpha < np.float32(needed * top)
             sums = None
             if below.any():
-                sums = np.zeros((below.shape[0] + 1, below.shape[1] + 1), np.int64)
-                sums[1:, 1:] = below.cumsum(axis=0).cumsum(axis=1)
+                sums = np.zeros((below.shape[0] + 1, below.shape[1] + 1), np.int32)
+                np.cumsum(below, axis=0, dtype=np.int32, out=sums[1:, 1:])
+                np.cumsum(sums[1:, 1:], axis=1, out=sums[1:, 1:])
             self._sums[key] = sums
         return self._sums[key]
 
 
-def _counts(sums: NDArray[np.int64], mesh: Mesh, texture: Texture) -> NDArray[np.int64]:
+def _counts(sums: NDArray[np.int32], mesh: Mesh, texture: Texture) -> NDArray[np.int32]:
     """(F,) marked texels in the boxes around the faces, of those that bilinear lookups reach. ``sums``: see
     ``_Tests._below``. A face that crosses the border of the image, where it repeats, counts all of it."""
     size = np.array(sums.shape[::-1]) - 1

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from appearance_opt import backend
+from appearance_opt.asset.alpha import kind_of
 from appearance_opt.config import DEVICES
 from appearance_opt.errors import InputError
 
@@ -75,7 +76,14 @@ def compare(
         from appearance_opt.jobs.report import write_compare_report
 
         write_compare_report(Path(out), first, second, result)
-    return replace(result, notes=(*first.notes, *second.notes))
+    return replace(result, notes=(*first.notes, *second.notes, *_drawn_otherwise(first, second)))
+
+
+def _drawn_otherwise(*assets: Asset) -> list[str]:
+    """A note on what the pictures show differently from what the files say."""
+    if all(kind_of(m.material) != "transmission" for a in assets for m in a.meshes):
+        return []
+    return ["transmission is drawn like blended alpha: nothing is refracted, coloured inside or blurred"]
 
 
 def compare_in_frame(
