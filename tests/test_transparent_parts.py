@@ -115,7 +115,9 @@ def test_nothing_left_to_work_on_is_refused(tmp_path: Path, snow_globe: Asset) -
 def test_a_start_from_a_file_leaves_its_transparent_parts_out(tmp_path: Path, snow_globe: Asset) -> None:
     save(snow_globe, tmp_path / "globe.glb")
     frame = ((0.0, 0.0, 0.0), 1.0)
-    mesh, notes = loaded_mesh(tmp_path / "globe.glb", frame, 5000, options(triangles=None, init="globe.glb"))
+    sides = np.zeros(5000, bool)
+    chosen = options(triangles=None, init="globe.glb")
+    mesh, notes = loaded_mesh(tmp_path / "globe.glb", frame, 5000, chosen, sides)
     assert len(mesh.faces) == len(snow_globe.meshes[1].faces)
     assert "of --init are left out" in notes[0]
 

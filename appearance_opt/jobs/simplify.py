@@ -41,11 +41,12 @@ CHECKPOINT_SECONDS = 10.0
 
 @dataclass
 class SimplifyResult:
-    """What ``simplify`` did. ``asset``: the result, whose first mesh was fitted; the others passed through, their
-    triangles are ``kept_triangles``, and ``triangles`` and ``source_triangles`` do not count them. ``start``: the same
-    before the fit; ``tessellated``: with a displacement map, the mesh as drawn at each level (and ``start`` at the
-    finest one); ``fit``: curve and counts; ``seconds``: wall-clock time by stage; ``notes``: what the user should know;
-    ``error``: set when the fit diverged (``simplify`` raises it after writing the best state)."""
+    """What ``simplify`` did. ``asset``: the result, whose first mesh was fitted (the first two where some faces are
+    seen from one side and others from both); the others passed through: they have ``kept_triangles``, which
+    ``triangles`` and ``source_triangles`` do not count. ``start``: the same before the fit; ``tessellated``: with a
+    displacement map, the mesh as drawn at each level (and ``start`` at the finest one); ``fit``: curve and counts;
+    ``seconds``: wall-clock time by stage; ``notes``: what the user should know; ``error``: set when the fit diverged
+    (``simplify`` raises it after writing the best state)."""
 
     asset: Asset
     start: Asset
