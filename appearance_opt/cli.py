@@ -197,6 +197,7 @@ def simplify(
             progress=progress,
             variants=_variants(variant),
             began=BEGAN,
+            inputs=[] if config is None else [config],
         )
     _print_result(out, result, folder)
 
@@ -273,7 +274,15 @@ def bake(
 
         with TerminalProgress() as progress:
             joined = run_joint(
-                high, low, out, options, report=folder, progress=progress, variants=_variants(variant), began=BEGAN
+                high,
+                low,
+                out,
+                options,
+                report=folder,
+                progress=progress,
+                variants=_variants(variant),
+                began=BEGAN,
+                inputs=[] if config is None else [config],
             )
         _print_result(out, joined, folder)
         return
@@ -288,6 +297,7 @@ def bake(
             progress=progress,
             variants=_variants(variant),
             began=BEGAN,
+            inputs=[] if config is None else [config],
         )
     for note in result.notes:
         print(f"note: {note}", file=sys.stderr)

@@ -15,9 +15,10 @@ from appearance_opt.asset.types import Asset, Mesh
 from appearance_opt.config import SimplifyOptions, simplify_options
 from appearance_opt.errors import InputError
 from appearance_opt.fit import adam
+from appearance_opt.fit.checkpoint import Checkpointer
 from appearance_opt.fit.smoothing import Smoother
 from appearance_opt.initial.sphere import sphere
-from appearance_opt.jobs.growth import kept, stretched
+from appearance_opt.jobs.growth import stretched
 from appearance_opt.jobs.simplify import simplify
 from appearance_opt.jobs.start import Start
 from appearance_opt.latent.parameter import Parameter
@@ -129,11 +130,12 @@ def test_a_broken_start_is_refused(ball: Asset, tmp_path: Path) -> None:
     path = tmp_path / "start.npz"
     path.write_bytes(b"not a start")
     with pytest.raises(InputError, match="not a usable start"):
-        kept(path, "job", never)
+        Checkpointer(tmp_path, "job", resume=True).start(never)
+    path.unlink()
     simplify(ball, None, options(steps=2), checkpoint=tmp_path)
     path.write_bytes(path.read_bytes()[:-100])  # a whole archive, cut short
     with pytest.raises(InputError, match="not a usable start"):
-        kept(path, "job", never)
+        Checkpointer(tmp_path, "job", resume=True).start(never)
 
 
 def test_the_start_of_another_job_is_refused(ball: Asset, tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ import pytest
 from appearance_opt.asset import load, save
 from appearance_opt.asset.types import Asset
 from appearance_opt.errors import InputError
-from appearance_opt.jobs.paths import check_paths
+from appearance_opt.jobs.paths import Outputs
 from appearance_opt.render.freezing import Frozen
 from tests.conftest import make_asset
 
@@ -282,14 +282,9 @@ def test_outputs_that_cannot_be_written_are_refused_before_any_work(tmp_path: Pa
     if not Path("/proc/self").exists():
         pytest.skip("needs a folder that nobody can write to")
     with pytest.raises(InputError, match="nothing can be written there"):
-        check_paths(None, Path("/proc/x.glb"), None, None)
+        Outputs.of("/proc/x.glb").check()
     (tmp_path / "file").write_bytes(b"")
-    for report, checkpoint in (("file", None), (None, "file"), ("file/x", None)):
+    for folder in ({"report": "file"}, {"checkpoint": "file"}, {"report": "file/x"}, {"textures": "file"}):
         with pytest.raises(InputError, match="not a folder"):
-            check_paths(
-                None,
-                tmp_path / "x.glb",
-                None if report is None else tmp_path / report,
-                None if checkpoint is None else tmp_path / checkpoint,
-            )
+            Outputs.of(tmp_path / "x.glb", **{k: tmp_path / v for k, v in folder.items()}).check()
     assert [p.name for p in tmp_path.iterdir()] == ["file"]

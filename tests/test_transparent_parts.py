@@ -17,8 +17,8 @@ from appearance_opt.jobs import report
 from appearance_opt.jobs.bake import BakeJob
 from appearance_opt.jobs.fitting import Stopwatch
 from appearance_opt.jobs.parts import split
-from appearance_opt.jobs.simplify import _fingerprint
-from appearance_opt.jobs.start import loaded_mesh
+from appearance_opt.jobs.simplify import fingerprint
+from appearance_opt.jobs.start import atlas_of
 from tests.conftest import grid_sphere
 
 QUICK = {"texture_size": 64, "resolution": 48, "pool": 4, "views": 2, "steps": 0, "reallocate": 0}
@@ -112,12 +112,9 @@ def test_nothing_left_to_work_on_is_refused(tmp_path: Path, snow_globe: Asset) -
         appearance_opt.simplify(snow_globe, None, options(triangles=None, init=str(tmp_path / "clear.glb")))
 
 
-def test_a_start_from_a_file_leaves_its_transparent_parts_out(tmp_path: Path, snow_globe: Asset) -> None:
-    save(snow_globe, tmp_path / "globe.glb")
+def test_a_start_from_a_file_leaves_its_transparent_parts_out(snow_globe: Asset) -> None:
     frame = ((0.0, 0.0, 0.0), 1.0)
-    sides = np.zeros(5000, bool)
-    chosen = options(triangles=None, init="globe.glb")
-    mesh, notes = loaded_mesh(tmp_path / "globe.glb", frame, 5000, chosen, sides)
+    mesh, notes = atlas_of(snow_globe, frame, 5000, options(triangles=None, init="globe.glb"), np.zeros(1, bool))
     assert len(mesh.faces) == len(snow_globe.meshes[1].faces)
     assert "of --init are left out" in notes[0]
 
@@ -171,7 +168,7 @@ def test_resuming_knows_what_stays(snow_globe: Asset) -> None:
     tinted = replace(shell, material=replace(GLASS, transmission=0.5))
     moved = replace(shell, positions=shell.positions * np.float32(1.1))
     prints = {
-        _fingerprint(replace(snow_globe, meshes=(one, *snow_globe.meshes[1:])), options())
+        fingerprint(options(), replace(snow_globe, meshes=(one, *snow_globe.meshes[1:])), None)
         for one in (shell, thicker, tinted, moved)
     }
     assert len(prints) == 4

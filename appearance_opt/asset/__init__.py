@@ -8,6 +8,7 @@ from pathlib import Path
 from appearance_opt.asset.companions import CHOICES, Companions, MissingTextures
 from appearance_opt.asset.types import Asset, Displacement, Material, Mesh, Texture
 from appearance_opt.errors import InputError
+from appearance_opt.publish import publishing
 
 __all__ = ["Asset", "Displacement", "Material", "Mesh", "Texture", "load", "save"]
 
@@ -111,10 +112,17 @@ def _name_of_variant(variants: dict[str, str] | None, path: Path) -> str | None:
 
 
 def save(asset: Asset, path: str | Path) -> None:
-    """Write an asset; the suffix chooses the format. Written under a temporary name, then renamed.
-    Raises InputError for a format that cannot be written, OSError when the disk refuses."""
+    """Write an asset; the suffix chooses the format. The files of a format that has several appear together or not at
+    all. Raises InputError for a format that cannot be written, OSError when the disk refuses."""
     path = Path(path)
     check_writable(path)
+    with publishing(path) as place:
+        write(asset, place)
+
+
+def write(asset: Asset, path: Path) -> None:
+    """Write an asset's files where they are to be, one after the other: for places of a publication. Raises
+    OSError."""
     suffix = path.suffix.lower()
     if suffix in (".glb", ".gltf"):
         from appearance_opt.asset.gltf_write import save_gltf

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path, PureWindowsPath
 from typing import TYPE_CHECKING, Literal, TypeVar, get_args
@@ -30,7 +31,8 @@ T = TypeVar("T")
 class Companions:
     """``policy``: refuse an asset that lacks a file, or go on without it. ``root``: folder in which files may
     lie beside that of the file that names them. ``notes``: the reader's notes; each file that was ignored is named
-    there once. ``files``: absolute paths of what was found. ``budget``: the memory that all of the asset may take."""
+    there once. ``files``: absolute paths of what the asset consists of, read or only mentioned. ``budget``: the memory
+    that all of the asset may take."""
 
     policy: MissingTextures = "error"
     root: Path | None = None
@@ -53,6 +55,15 @@ class Companions:
             )
         self.files.append(found.resolve())
         return found
+
+    def mention(self, reference: str, owner: Path, percent_encoded: bool = False) -> None:
+        """Note that ``owner`` refers to a file, which need not be read, nor be there: what nothing shows yet belongs
+        to the asset, too, and must not be replaced."""
+        text = unquote(reference) if percent_encoded else reference
+        with suppress(OSError, ValueError, RuntimeError):  # no file name
+            path = (owner.resolve().parent / text.replace("\\", "/")).resolve()
+            if path.is_file() and path not in self.files:
+                self.files.append(path)
 
     def _find(self, reference: str, owner: Path, percent_encoded: bool) -> Path:
         """Raises InputError as ``resolve`` does.

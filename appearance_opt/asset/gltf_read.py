@@ -37,7 +37,12 @@ lights. They are ignored with a note even where a file calls them required."""
 def load_gltf(path: Path, companions: Companions, keep_layout: bool = False, variant: str | None = None) -> Asset:
     """Read a .gltf or .glb file. ``keep_layout``: see ``asset.load``; ``variant``: name of a KHR_materials_variants
     variant. Raises InputError."""
-    return _Reader(Document(path, companions), keep_layout, variant).asset()
+    document = Document(path, companions)
+    for item in (*document.items("buffers"), *document.items("images")):
+        uri = item.get("uri")
+        if isinstance(uri, str) and not uri.startswith("data:"):
+            companions.mention(uri, path, percent_encoded=True)
+    return _Reader(document, keep_layout, variant).asset()
 
 
 class _Reader:

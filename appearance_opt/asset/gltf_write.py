@@ -15,7 +15,6 @@ from appearance_opt.asset import images
 from appearance_opt.asset.encoding import encoded_for
 from appearance_opt.asset.gltf_materials import IOR, STRENGTH, TRANSMISSION, VOLUME
 from appearance_opt.asset.height import as_16_bit, height_png
-from appearance_opt.asset.paths import replacing
 from appearance_opt.asset.sides import apart_from_sides
 
 if TYPE_CHECKING:
@@ -36,22 +35,17 @@ def save_gltf(asset: Asset, path: Path) -> None:
     path = Path(path)
     writer = _Writer(asset, path.stem)
     for name, data in writer.companions.items():
-        with replacing(path.with_name(name)) as temporary:
-            temporary.write_bytes(data)
+        path.with_name(name).write_bytes(data)
     if path.suffix.lower() == ".glb":
         writer.embed_images()
-        with replacing(path) as temporary:
-            temporary.write_bytes(writer.glb())
+        path.write_bytes(writer.glb())
         return
     for k, data in enumerate(writer.image_files):
-        with replacing(path.with_name(f"{path.stem}_{k}.png")) as temporary:
-            temporary.write_bytes(data)
+        path.with_name(f"{path.stem}_{k}.png").write_bytes(data)
         writer.json["images"][k] = {"uri": quote(f"{path.stem}_{k}.png")}
-    with replacing(path.with_suffix(".bin")) as temporary:
-        temporary.write_bytes(bytes(writer.binary))
+    path.with_suffix(".bin").write_bytes(bytes(writer.binary))
     writer.json["buffers"] = [{"uri": quote(f"{path.stem}.bin"), "byteLength": len(writer.binary)}]
-    with replacing(path) as temporary:
-        temporary.write_text(json.dumps(writer.json, indent=1))
+    path.write_text(json.dumps(writer.json, indent=1))
 
 
 class _Writer:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import struct
 import tempfile
 import zlib
@@ -37,6 +38,8 @@ def decode(data: bytes, name: str, budget: Budget | None = None) -> NDArray:
     suffix = _suffix(data, name)
     if suffix == ".png":
         check_png(data, name)
+    elif suffix == ".jpg":
+        check_jpeg(data, name)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / ("image" + suffix)
         path.write_bytes(data)
@@ -73,6 +76,28 @@ def check_png(data: bytes, name: str) -> None:
             return
         offset = end
     raise InputError(f"{name}: the image is damaged (cut short); export it again")
+
+
+_MARKER = re.compile(rb"\xff+([\x01-\xcf\xd8-\xfe])", re.DOTALL)
+"""A marker that is none of those within the data of a scan: stuffed zeros and restarts."""
+
+
+def check_jpeg(data: bytes, name: str) -> None:
+    """Raise InputError if a JPEG file ends before its end-of-image marker (ITU-T T.81, annex B).
+
+    Readers fill what is missing with grey and say nothing.
+    """
+    offset = 2
+    while (found := _MARKER.search(data, offset)) is not None:
+        marker, offset = found[1][0], found.end()
+        if marker == _END_OF_IMAGE:
+            return
+        if marker != _TEMPORARY:  # the others have a length
+            offset += int.from_bytes(data[offset : offset + 2], "big")
+    raise InputError(f"{name}: the image is damaged (cut short); export it again")
+
+
+_END_OF_IMAGE, _TEMPORARY = 0xD9, 0x01
 
 
 def _open(path: Path, name: str, budget: Budget | None) -> NDArray:

@@ -68,6 +68,9 @@ def _read(path: Path, companions: Companions) -> Any:
         document.flattenSubgraphs()  # nodes that the document itself makes of others
     except (mx.Exception, mx.ExceptionParseError, RuntimeError) as error:
         raise InputError(f"{path}: not a readable MaterialX file ({' '.join(str(error).split())[:160]})") from None
+    for element in document.traverseTree():
+        if isinstance(element, mx.Input) and element.getType() == "filename":
+            companions.mention(element.getResolvedValueString(), path)
     return document
 
 

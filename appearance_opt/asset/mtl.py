@@ -44,6 +44,9 @@ _USED = ("map_kd", "map_pr", "map_pm", "map_ke", "map_ka", "map_d", "map_aat", *
 """Maps that are read; that of the ambient colour, which lights nothing here, usually repeats the diffuse one, and
 ``map_aat`` is a switch, not a map."""
 
+_FILES = ("map_", "norm", "bump", "disp", "decal", "refl")
+"""Start of the statements that name a file, whether it is read or not."""
+
 WITHOUT_MAP, LOST = "# without its map: ", "lost:"
 """Start of the comments in which our own files keep a constant for when its map gets lost, and what stands for it here
 before the constant's key. The maps hold the factors there, and the constants beside them are 1 (see ``obj_write``)."""
@@ -99,6 +102,9 @@ class MaterialReader:
                 current = statements.setdefault(words[1].strip(), {})
             else:
                 current[words[0].lower()] = words[1].strip()
+                if words[0].lower().startswith(_FILES):
+                    for name in (words[1].strip(), words[1].split()[-1]):
+                        self.companions.mention(name, path)
         for name, values in statements.items():
             self.by_name[name] = self._material(name, values, path)
             if any(udim.is_tiled(v) for v in values.values()):

@@ -11,7 +11,7 @@ from appearance_opt.asset import images
 from appearance_opt.asset.alpha import coverage, kind_of
 from appearance_opt.asset.encoding import encoded_for
 from appearance_opt.asset.mtl import ALPHA_TEST, WITHOUT_MAP
-from appearance_opt.asset.paths import file_name, replacing
+from appearance_opt.asset.paths import file_name
 from appearance_opt.asset.sides import apart_from_sides
 from appearance_opt.asset.types import Texture, linear_to_srgb
 
@@ -35,8 +35,7 @@ def save_obj(asset: Asset, path: Path) -> None:
     mtl = ["# appearance-opt"]
     for key, m in {look[id(m.material)]: m.material for m in asset.meshes}.items():
         mtl += _mtl_lines(replace(m, name=named[key]), path)
-    with replacing(path.with_suffix(".mtl")) as temporary:
-        temporary.write_text("\n".join(mtl) + "\n", encoding="utf-8")
+    path.with_suffix(".mtl").write_text("\n".join(mtl) + "\n", encoding="utf-8")
     lines = ["# appearance-opt", f"mtllib {path.stem}.mtl"]
     start = np.ones(3, np.int64)  # of this mesh's positions, texture coordinates and normals in the whole file
     for mesh in asset.meshes:
@@ -51,8 +50,7 @@ def save_obj(asset: Asset, path: Path) -> None:
         for face in mesh.faces.tolist():
             lines.append("f " + " ".join(form.format(*(start + i)) for i in face))
         start += np.where(has, len(mesh.positions), 0)
-    with replacing(path) as temporary:
-        temporary.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
 def _vertices(mesh: Mesh, origin: tuple[float, float, float]) -> list[str]:
@@ -83,8 +81,7 @@ def _mtl_lines(m: Material, path: Path) -> list[str]:
 
     def picture(suffix: str, pixels: NDArray) -> str:
         target = path.with_name(f"{path.stem}_{file_name(m.name)}_{suffix}.png")
-        with replacing(target) as temporary:
-            temporary.write_bytes(images.encode_png(np.ascontiguousarray(pixels)))
+        target.write_bytes(images.encode_png(np.ascontiguousarray(pixels)))
         return target.name
 
     def plane(channel: int, factor: float) -> NDArray:

@@ -1,12 +1,10 @@
-"""Files that an asset refers to, and atomic writing."""
+"""Files that an asset refers to."""
 
 from __future__ import annotations
 
 import codecs
 import os
 import re
-import tempfile
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 from urllib.parse import unquote, urlparse
@@ -14,7 +12,7 @@ from urllib.parse import unquote, urlparse
 from appearance_opt.errors import InputError, MissingFileError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
+    from collections.abc import Iterable
 
 
 def resolve(reference: str, owner: Path, percent_encoded: bool = False, root: Path | None = None) -> Path:
@@ -113,22 +111,3 @@ MAX_NAME = 80
 def file_name(name: str) -> str:
     """A name that every file system takes, made of ``name``. Different names may become equal."""
     return re.sub(r"[^A-Za-z0-9._-]", "_", name)[:MAX_NAME]
-
-
-@contextmanager
-def replacing(path: Path) -> Iterator[Path]:
-    """A temporary name in the folder of ``path`` (same suffix), renamed to it when all went well and
-    removed when not."""
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.stem}-", suffix=path.suffix)
-    os.close(handle)
-    temporary = Path(name)
-    try:
-        yield temporary
-        mask = os.umask(0)
-        os.umask(mask)
-        temporary.chmod(0o666 & ~mask)
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)

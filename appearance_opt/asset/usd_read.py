@@ -79,6 +79,7 @@ def _read_stage(path: Path, refine: int, variants: dict[str, str], companions: C
         raise InputError(f"{path}: not a readable USD file")
     _select(stage, variants, path)
     _refuse_escapes(stage, path, companions)
+    _mention_all(stage, path, companions)
     return _Reader(stage, path, refine, companions, keep_layout).asset()
 
 
@@ -122,6 +123,21 @@ def _folder_of_all(stage: Any, path: Path, root: Path | None) -> Path:
     own = path.resolve().parent
     outside = [folder for folder in folders if not folder.is_relative_to(own)]
     return common_folder([*outside, *([] if root is None else [root.resolve()])])
+
+
+def _mention_all(stage: Any, path: Path, companions: Companions) -> None:
+    """Layers and packages, and whatever they refer to: layers of variants that are not chosen, pictures that no
+    material shows."""
+    from pxr import UsdUtils
+
+    for layer in stage.GetUsedLayers():
+        if layer.anonymous or not layer.realPath:
+            continue
+        file = Path(layer.realPath.split("[")[0])
+        companions.mention(str(file), path)
+        for references in UsdUtils.ExtractExternalReferences(layer.identifier):
+            for reference in references:
+                companions.mention(reference.split("[")[0], file)
 
 
 def _metres_per_unit(stage: Any) -> float:

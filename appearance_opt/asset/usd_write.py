@@ -14,7 +14,7 @@ from appearance_opt.asset import images
 from appearance_opt.asset.alpha import coverage, kind_of
 from appearance_opt.asset.encoding import encoded_for
 from appearance_opt.asset.height import as_16_bit, height_png
-from appearance_opt.asset.paths import MAX_NAME, replacing
+from appearance_opt.asset.paths import MAX_NAME
 from appearance_opt.asset.sides import apart_from_sides
 
 if TYPE_CHECKING:
@@ -32,29 +32,19 @@ def save_usd(asset: Asset, path: Path) -> None:
     from pxr import Sdf, Tf, UsdUtils
 
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
     package = path.suffix.lower() == ".usdz"
-    folder = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.stem}-"))
+    folder = Path(tempfile.mkdtemp(dir=path.parent)) if package else path.parent
     try:
         root = folder / (path.stem + (".usdc" if package else path.suffix))
         _write_stage(asset, root, f"{path.stem}_textures")
-        if package:
-            with replacing(path) as temporary:
-                if not UsdUtils.CreateNewUsdzPackage(Sdf.AssetPath(str(root)), str(temporary)):
-                    raise OSError(errno.EIO, "the USDZ package could not be written", str(path))
-            return
-        textures = folder / f"{path.stem}_textures"
-        if textures.exists():
-            target = path.parent / textures.name
-            target.mkdir(exist_ok=True)
-            for file in textures.iterdir():
-                file.replace(target / file.name)
-        root.replace(path)
+        if package and not UsdUtils.CreateNewUsdzPackage(Sdf.AssetPath(str(root)), str(path)):
+            raise OSError(errno.EIO, "the USDZ package could not be written", str(path))
     except Tf.ErrorException as error:  # USD has its own exceptions for what the system reports
         reason = "the USD file could not be written; is the disk full?"
         raise OSError(errno.EIO, reason, str(path)) from error
     finally:
-        shutil.rmtree(folder, ignore_errors=True)
+        if package:
+            shutil.rmtree(folder, ignore_errors=True)
 
 
 def _write_stage(asset: Asset, root: Path, textures: str) -> None:

@@ -7,8 +7,6 @@ import html
 import json
 import math
 import re
-import shutil
-import tempfile
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,6 +15,7 @@ from appearance_opt.asset.images import encode_png
 from appearance_opt.errors import one_line
 from appearance_opt.evaluate.metrics import Metrics
 from appearance_opt.evaluate.template import PAGE, SLIDER_SCRIPT, STYLE
+from appearance_opt.publish import publishing
 
 if TYPE_CHECKING:
     import numpy as np
@@ -39,26 +38,19 @@ class ReportData:
 
 
 def write_report(folder: Path, data: ReportData) -> None:
-    """Write the report. The folder appears (or is replaced file by file) only once it is complete."""
+    """Write the report, all of its files or none. Other files in the folder stay."""
     folder = Path(folder)
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    building = Path(tempfile.mkdtemp(dir=folder.parent, prefix=f".{folder.name}-"))
-    try:
-        encoded: dict[str, bytes] = {}
-        for k, view in enumerate(data.views):
-            for name, pixels in view.items():
-                encoded[f"view{k}_{_slug(name)}.png"] = encode_png(pixels)
-        for name, pixels in data.maps.items():
-            encoded[f"map_{_slug(name)}.png"] = encode_png(pixels)
+    encoded: dict[str, bytes] = {}
+    for k, view in enumerate(data.views):
+        for name, pixels in view.items():
+            encoded[f"view{k}_{_slug(name)}.png"] = encode_png(pixels)
+    for name, pixels in data.maps.items():
+        encoded[f"map_{_slug(name)}.png"] = encode_png(pixels)
+    with publishing(folder / "report.html") as place:
         for name, content in encoded.items():
-            (building / name).write_bytes(content)
-        (building / "report.json").write_text(json.dumps(as_json(data), indent=1, allow_nan=False))
-        (building / "report.html").write_text(page(data, encoded), encoding="utf-8")
-        folder.mkdir(exist_ok=True)
-        for file in sorted(building.iterdir()):
-            file.replace(folder / file.name)
-    finally:
-        shutil.rmtree(building, ignore_errors=True)
+            place.with_name(name).write_bytes(content)
+        place.with_name("report.json").write_text(json.dumps(as_json(data), indent=1, allow_nan=False))
+        place.write_text(page(data, encoded), encoding="utf-8")
 
 
 _CURVE = ("seconds", "step", "psnr", "loss")

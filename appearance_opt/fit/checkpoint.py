@@ -6,22 +6,26 @@ import logging
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from appearance_opt.digest import digest
 from appearance_opt.errors import InputError
 from appearance_opt.fit import archive
 from appearance_opt.fit.adam import Moments
+from appearance_opt.lock import lock_path
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from appearance_opt.fit.model import Model
 
 log = logging.getLogger(__name__)
 
-FILE, START_FILE = "fit.npz", "start.npz"
+T = TypeVar("T")
 
 
 @dataclass
@@ -41,79 +45,127 @@ class FitState:
     curve: list[tuple[float, int, float, float]] = field(default_factory=list)
 
 
-_NUMBERS = ("iteration", "loss", "laplacian", "skipped", "seconds", "best_psnr", "best_iteration", "unfolded")
+@dataclass
+class Kept:
+    """What is kept of a fit. ``start``: hash of the start that it began with; ``values``: of the parameters."""
+
+    start: str
+    values: dict[str, mi.Float]
+    state: FitState
 
 
 class Checkpointer:
-    """Writes checkpoints of one job into a folder, at most every ``interval`` seconds.
+    """Keeps start and state of one job in a folder, the state at most every ``interval`` seconds.
 
-    ``fingerprint`` identifies input and options: a checkpoint of another job is refused.
+    ``fingerprint`` identifies input and options: a checkpoint of another job is refused. Without ``resume``,
+    checkpoints that are there are removed. Raises InputError when the folder holds anything else.
     """
 
     def __init__(self, folder: Path, fingerprint: str, resume: bool, interval: float = 10.0) -> None:
-        self.path = Path(folder) / FILE
-        self.fingerprint, self.resume, self.interval = fingerprint, resume, interval
+        self.folder, self.fingerprint, self.resume, self.interval = Path(folder), fingerprint, resume, interval
+        self.path, self.start_path = self.folder / archive.STATE_FILE, self.folder / archive.START_FILE
+        self.start_hash, self._failed = "", False
         self._last = time.monotonic()
-        self.path.parent.mkdir(parents=True, exist_ok=True)
+        self.folder.mkdir(parents=True, exist_ok=True)
+        self._check_folder()
         if not resume:
-            self.start_path.unlink(missing_ok=True)
+            self._clear()
 
-    @property
-    def start_path(self) -> Path:
-        """Where a start that cannot be made again is kept. Removed unless a job is resumed."""
-        return self.path.with_name(START_FILE)
+    def _check_folder(self) -> None:
+        for path in self.folder.iterdir():
+            if path.name not in archive.FILES and not _temporary(path) and path.name != lock_path(path).name:
+                raise InputError(
+                    f"{self.folder}: holds '{path.name}', which is no checkpoint; choose an empty folder or a new one"
+                )
+
+    def _clear(self) -> None:
+        """Remove what an earlier run has left; the state first, as it belongs to the start."""
+        there = [path for path in (self.path, self.start_path) if path.exists()]
+        for path in there:
+            try:
+                archive.fingerprint_of(path)
+            except archive.DamagedError as error:
+                raise InputError(
+                    f"{path}: is no checkpoint, or a damaged one ({error}); delete it, or choose another folder"
+                ) from error
+        if self.path in there:
+            log.warning("%s: the checkpoint of an earlier run is removed (--resume goes on from it)", self.folder)
+        for path in (*there, *filter(_temporary, self.folder.iterdir())):
+            path.unlink()
+
+    def start(self, make: Callable[[], tuple[T, bool]], *classes: type) -> tuple[T, bool]:
+        """(start, interrupted): the one that is kept, if the job is resumed, or one that is made and kept. Made again,
+        it could be another one, as the time that is left decides how often triangles are moved. ``classes``: what it
+        consists of. Raises InputError when the kept one is damaged or belongs to another job."""
+        if self.start_path.exists():
+            try:
+                start, interrupted = archive.read(self.start_path, self.fingerprint, classes), False
+            except archive.DamagedError as error:
+                raise InputError(
+                    f"{self.start_path}: not a usable start ({error}); empty the folder to begin anew"
+                ) from error
+        else:
+            start, interrupted = make()
+            archive.write(self.start_path, self.fingerprint, start)
+        self.start_hash = digest(start)
+        return start, interrupted
 
     def due(self) -> bool:
         """Is it time for another checkpoint?"""
         return time.monotonic() - self._last >= self.interval
 
     def save(self, model: Model, state: FitState) -> None:
-        """Write the state; see ``archive.write``."""
-        arrays: dict[str, np.ndarray] = {}
-        arrays.update({name: np.array(getattr(state, name)) for name in _NUMBERS})
-        arrays["curve"] = np.array(state.curve, np.float64).reshape(-1, 4)
-        for name, parameter in model.parameters.items():
-            moments = state.moments[name]
-            arrays[f"value/{name}"] = np.array(parameter.value)
-            arrays[f"first/{name}"] = np.array(moments.first)
-            arrays[f"second/{name}"] = np.array(moments.second)
-            arrays[f"mean/{name}"] = np.array(moments.mean)
-            arrays[f"steps/{name}"] = np.array(moments.steps)
-            if state.best is not None:
-                arrays[f"best/{name}"] = np.array(state.best[name])
-        archive.write(self.path, self.fingerprint, arrays)
+        """Write the state; see ``archive.write``. Where it cannot be written, the fit is worth more than its
+        checkpoint: this is said once, and the one before stays."""
+        try:
+            archive.write(self.path, self.fingerprint, Kept(self.start_hash, model.values(), state))
+        except OSError as error:
+            if not self._failed:
+                log.warning("%s: cannot be written (%s); the fit goes on without", self.path, error.strerror)
+            self._failed = True
+        archive.write(self.path, self.fingerprint, Kept(self.start_hash, model.values(), state))
         self._last = time.monotonic()
 
     def restore(self, model: Model, state: FitState) -> bool:
         """Bring model and state to the checkpoint, if one is to be resumed and exists. Raises InputError
-        when it is broken or belongs to another job."""
+        when it is damaged or belongs to another job or another start."""
         if not self.resume:
             return False
         if not self.path.exists():
-            log.info("no checkpoint in %s: starting from the beginning", self.path.parent)
+            log.info("no checkpoint in %s: starting from the beginning", self.folder)
             return False
         try:
-            arrays = archive.read(self.path, self.fingerprint)
-            _fill(model, state, arrays)
-        except archive.UNREADABLE as error:
-            raise InputError(f"{self.path}: not a usable checkpoint ({error}); delete it to start anew") from error
-        model.update_scene()
+            kept = archive.read(self.path, self.fingerprint, (Kept, FitState, Moments), mi.Float)
+            _check(kept, model)
+        except archive.DamagedError as error:
+            raise InputError(
+                f"{self.path}: not a usable checkpoint ({error}); empty the folder to start anew"
+            ) from error
+        if kept.start != self.start_hash:
+            raise InputError(
+                f"{self.path}: this checkpoint belongs to another start than {self.start_path.name} beside it; "
+                "empty the folder to start anew"
+            )
+        vars(state).update(vars(kept.state))
+        model.restore(kept.values)
         return True
 
 
-def _fill(model: Model, state: FitState, arrays: dict[str, np.ndarray]) -> None:
-    best = {}
+def _temporary(path: Path) -> bool:
+    """Did a killed run leave this file half written?"""
+    return path.suffix == archive.TEMPORARY and path.name.startswith((".fit-", ".start-"))
+
+
+def _check(kept: Kept, model: Model) -> None:
+    """Raise DamagedError if there are not as many numbers as the model has."""
+    if not isinstance(kept, Kept) or not isinstance(kept.state, FitState):
+        raise archive.DamagedError("it holds no state of a fit")
     for name, parameter in model.parameters.items():
-        there, wanted = arrays[f"value/{name}"].size, dr.width(parameter.value)
-        if there != wanted:
-            raise ValueError(f"it holds {there} {name}, the start has {wanted}")
-    for name, parameter in model.parameters.items():
-        parameter.value = mi.Float(arrays[f"value/{name}"])
-        first, second, mean = (mi.Float(arrays[f"{kind}/{name}"]) for kind in ("first", "second", "mean"))
-        state.moments[name] = Moments(first, second, mean, int(arrays[f"steps/{name}"]))
-        if f"best/{name}" in arrays:
-            best[name] = mi.Float(arrays[f"best/{name}"])
-    for name in _NUMBERS:
-        setattr(state, name, type(getattr(state, name))(arrays[name]))
-    state.curve = [(float(s), int(i), float(p), float(v)) for s, i, p, v in arrays["curve"]]
-    state.best = best or None
+        wanted, moments = dr.width(parameter.value), kept.state.moments.get(name)
+        if name not in kept.values or moments is None or name not in (kept.state.best or model.parameters):
+            raise archive.DamagedError(f"it holds no {name}")
+        rows = [kept.values[name], moments.first, moments.second, moments.mean]
+        rows += [] if kept.state.best is None else [kept.state.best[name]]
+        for row in rows:
+            if dr.width(row) != wanted:
+                raise archive.DamagedError(f"it holds {dr.width(row)} {name}, the start has {wanted}")

@@ -26,6 +26,8 @@ from appearance_opt.render.display import BACKGROUND as GREY
 from appearance_opt.render.gradient import Quality
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from numpy.typing import NDArray
 
     from appearance_opt.reference.pool import ReferencePool
@@ -124,14 +126,17 @@ def fit(
     options: FitOptions,
     progress: Progress | None = None,
     checkpointer: Checkpointer | None = None,
+    stop: Callable[[], bool] | None = None,
 ) -> FitResult:
-    """Fit the model to the pool's reference. Raises DivergedError (the model then holds the best
-    state)."""
+    """Fit the model to the pool's reference. ``stop``: asked before every step whether the fit shall end early. A
+    KeyboardInterrupt ends it in the same way. Raises DivergedError (the model then holds the best state)."""
     run = _Run(model, pool, validation, options, progress, checkpointer)
     try:
         if run.state.best is None:
             run.look()
         while not run.clock.done(run.state.iteration):
+            if stop is not None and stop():
+                raise KeyboardInterrupt
             run.advance()
     except KeyboardInterrupt:
         log.warning("interrupted at step %d: the best state so far is kept", run.state.iteration)

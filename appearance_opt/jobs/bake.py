@@ -10,13 +10,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from appearance_opt import backend
-from appearance_opt.asset import load, save
+from appearance_opt.asset import load, write
 from appearance_opt.asset.alpha import seen_through
-from appearance_opt.asset.paths import replacing
 from appearance_opt.errors import DivergedError, InputError
+from appearance_opt.interrupts import Interrupts
 from appearance_opt.jobs.parts import split
+from appearance_opt.jobs.paths import Outputs
+from appearance_opt.publish import Publication, publication
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     from numpy.typing import NDArray
 
     from appearance_opt.asset.types import Asset
@@ -67,41 +71,61 @@ def bake(
     progress: Progress | None = None,
     variants: dict[str, str] | None = None,
     began: float | None = None,
+    inputs: Iterable[str | Path] = (),
 ) -> BakeResult:
     """Bake ``high`` to ``low`` (paths or assets) and write LOW with its new maps to ``out`` (None: do not write).
 
     ``report``: folder for pictures, metrics and report.html. ``textures``: folder for the maps as loose files;
     maps for which the format of ``out`` has no place are always written, by default to ``<out's stem>_maps``.
-    Raises AppearanceError.
+    ``inputs``: other files that must not be replaced. Raises AppearanceError.
     """
-    from appearance_opt.jobs.fitting import Stopwatch, conclude
-    from appearance_opt.jobs.paths import check_paths, check_replaces
-    from appearance_opt.jobs.simplify import loaded
+    from appearance_opt.jobs.fitting import Stopwatch
 
     if options.joint:
         raise InputError("joint bakes have a function of their own, appearance_opt.joint, with another result")
     watch = Stopwatch(began)
-    for source in (high, low):
-        check_paths(source, out, report, textures)
+    outputs = Outputs.of(out, options, report=report, textures=textures)
+    outputs.check()
+    outputs.check_sources(high, low, *inputs)
+    with outputs.held(), Interrupts() as interrupts:
+        return _baked(high, low, outputs, options, progress, variants, watch, interrupts)
+
+
+def _baked(
+    high: str | Path | Asset,
+    low: str | Path | Asset,
+    outputs: Outputs,
+    options: BakeOptions,
+    progress: Progress | None,
+    variants: dict[str, str] | None,
+    watch: Stopwatch,
+    interrupts: Interrupts,
+) -> BakeResult:
+    from appearance_opt.jobs.fitting import conclude
+    from appearance_opt.jobs.simplify import loaded
+
     heavy, light = loaded(high, options, variants), loaded_low(low, options)
-    check_replaces((heavy, light), out, textures)
+    outputs.check_inputs(heavy, light)
+    outputs.check_room(light.triangle_count, options)
     watch.lap("load")
-    run = BakeJob(*split_pair(high, heavy, low, light), options, watch)
-    result, error = run.run(progress, report is not None)
-    if out is not None:
-        save(result.asset, out)
-        _write_loose(result, options, Path(out), textures)
+    run = BakeJob(*split_pair(high, heavy, low, light), options, watch, interrupts)
+    result, error = run.run(progress, outputs.report is not None)
+    if outputs.out is not None:
+        with publication() as together:
+            write(result.asset, together.place(outputs.out))
+            _write_loose(result, options, outputs.out, outputs.textures, together)
         watch.lap("write")
+    interrupts.release()
     if error is not None:
         raise error
 
     def write_report() -> None:
         from appearance_opt.jobs.report import write_bake_report
 
-        assert report is not None
-        write_bake_report(Path(report), run.high, result, *run.view_of_all(), options)
+        assert outputs.report is not None
+        write_bake_report(outputs.report, run.high, result, *run.view_of_all(), options)
 
-    conclude(result, watch, None if report is None else write_report)
+    conclude(result, watch, None if outputs.report is None else write_report)
     return result
 
 
@@ -125,14 +149,22 @@ class BakeJob:
     """Both assets in one frame; then the closed form, then the fit. ``high``: all of HIGH, where it was aligned;
     ``low_parts``: what of LOW is baked onto, and what is left alone."""
 
-    def __init__(self, high_parts: Parts, low_parts: Parts, name: str, options: BakeOptions, watch: Stopwatch) -> None:
+    def __init__(
+        self,
+        high_parts: Parts,
+        low_parts: Parts,
+        name: str,
+        options: BakeOptions,
+        watch: Stopwatch,
+        interrupts: Interrupts,
+    ) -> None:
         from appearance_opt.baking import check
         from appearance_opt.baking.low import moved, prepare, unwrapped
         from appearance_opt.jobs.simplify import in_frame, support
         from appearance_opt.reference.mesh import MeshReference
         from appearance_opt.views import ViewSampler, framing
 
-        self.options, self.watch, self.low_parts = options, watch, low_parts
+        self.options, self.watch, self.interrupts, self.low_parts = options, watch, interrupts, low_parts
         high, low = high_parts.fitted, low_parts.fitted
         self.notes = [*high.notes, *high_parts.told("of HIGH are not baked")]
         self.notes += [*(f"LOW: {n}" for n in low.notes), *low_parts.told("of LOW stay as they are")]
@@ -205,7 +237,14 @@ class BakeJob:
         start = Start(self.mesh, {n: baked.maps[n] for n in _FITTED}, True, baked.covered)
         options = replace(self.options, fit=parts)
         model, fitted, error = fit_start(
-            self.reference, self.sampler, start, options, self.watch, progress=progress, with_report=with_report
+            self.reference,
+            self.sampler,
+            start,
+            options,
+            self.watch,
+            interrupts=self.interrupts,
+            progress=progress,
+            with_report=with_report,
         )
         # gutters were filled before the fit, which moved those that lookups reach: filling again would undo that
         maps = {**baked.maps, **model.host_maps()}
@@ -279,7 +318,9 @@ class BakeJob:
 _FITTED = ("red", "green", "blue", "roughness", "metalness", "normal_x", "normal_y", "normal_z")
 
 
-def _write_loose(result: BakeResult, options: BakeOptions, out: Path, folder: str | Path | None) -> None:
+def _write_loose(
+    result: BakeResult, options: BakeOptions, out: Path, folder: Path | None, together: Publication
+) -> None:
     """Loose files, if asked for or if the format of ``out`` has no place for one of the maps."""
     from appearance_opt.baking.encode import loose_files
 
@@ -288,7 +329,6 @@ def _write_loose(result: BakeResult, options: BakeOptions, out: Path, folder: st
     placeless |= options.wants("displacement") and out.suffix.lower() == ".obj"
     if folder is None and not placeless:
         return
-    target = out.with_name(out.stem + "_maps") if folder is None else Path(folder)
+    target = out.with_name(out.stem + "_maps") if folder is None else folder
     for name, data in loose_files(result.maps, result.covered, result.missed, options, out.stem).items():
-        with replacing(target / name) as temporary:
-            temporary.write_bytes(data)
+        together.place(target / name).write_bytes(data)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -12,6 +12,7 @@ from appearance_opt import backend
 from appearance_opt.asset.alpha import kind_of
 from appearance_opt.config import DEVICES
 from appearance_opt.errors import InputError
+from appearance_opt.jobs.paths import Outputs
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -53,18 +54,32 @@ def compare(
     ``out``: folder for a report with pictures. ``refine``, ``missing_textures``, ``root``, ``crease_angle``: see
     ``load``; ``variants``: of the reference. What is transparent is drawn so (see ``render.layers``). Raises
     AppearanceError, also if one of the two shows nothing."""
-    from appearance_opt.asset import load
-    from appearance_opt.asset.types import Asset
-
     if device not in DEVICES:
         raise InputError(f"--device {device}: choose from {', '.join(DEVICES)}")
     if seed < 0:
         raise InputError(f"--seed {seed}: must be 0 or more")
-    given = {"refine": refine, "missing_textures": missing_textures, "root": root, "crease_angle": crease_angle}
-    first, second = (
-        a if isinstance(a, Asset) else load(a, variants=chosen, **given)  # type: ignore[arg-type]
-        for a, chosen in ((reference, variants), (candidate, None))
-    )
+    outputs = Outputs.of(None, report=out)
+    outputs.check()
+    outputs.check_sources(reference, candidate)
+    reading = {"refine": refine, "missing_textures": missing_textures, "root": root, "crease_angle": crease_angle}
+    with outputs.held():
+        given = ((reference, {**reading, "variants": variants}), (candidate, reading))
+        return _compared(given, outputs, (views, resolution, samples, seed, device))
+
+
+def _compared(
+    both: tuple[tuple[str | Path | Asset, dict[str, Any]], tuple[str | Path | Asset, dict[str, Any]]],
+    outputs: Outputs,
+    drawing: tuple[int, int, int, int, str],
+) -> Comparison:
+    """``both``: each with how it is to be read; ``drawing``: views, resolution, samples, seed, device."""
+    from appearance_opt.asset import load
+    from appearance_opt.asset.types import Asset
+
+    views, resolution, samples, seed, device = drawing
+    first, second = (a if isinstance(a, Asset) else load(a, **reading) for a, reading in both)
+    outputs.check_inputs(first, second)
+    outputs.check_room(0, None)
     backend.select(device)
     from appearance_opt.jobs.simplify import framed, in_frame
     from appearance_opt.views import MEASURED
@@ -72,10 +87,10 @@ def compare(
     frame, sampler = framed(np.concatenate([first.points(), second.points()]), seed)
     sampler = sampler.held_out(MEASURED)
     result = compare_in_frame(in_frame(first, *frame), in_frame(second, *frame), sampler, views, resolution, samples)
-    if out is not None:
+    if outputs.report is not None:
         from appearance_opt.jobs.report import write_compare_report
 
-        write_compare_report(Path(out), first, second, result)
+        write_compare_report(outputs.report, first, second, result)
     return replace(result, notes=(*first.notes, *second.notes, *_drawn_otherwise(first, second)))
 
 

@@ -12,9 +12,7 @@ import numpy as np
 from scipy.ndimage import median_filter
 
 from appearance_opt import memory
-from appearance_opt.asset import save
 from appearance_opt.asset.height import displacement_of, height_png
-from appearance_opt.asset.paths import replacing
 from appearance_opt.baking.closed_form import Settings, bake
 from appearance_opt.errors import InputError
 from appearance_opt.initial.atlas import GUTTER
@@ -153,15 +151,8 @@ class Exporter:
         return replace(to_asset(mesh, placed, maps, name), origin=self.origin)
 
 
-def write_levels(tessellated: dict[int, Asset], out: Path) -> None:
-    """The tessellated meshes beside ``out``: ``<stem>_level<k><suffix>``."""
-    for level, asset in tessellated.items():
-        save(asset, out.with_name(f"{out.stem}_level{level}{out.suffix}"))
-
-
 def write_companion(asset: Asset, out: Path) -> None:
     """The displacement map as ``<stem>_displacement.png`` for a format that has no place for its name."""
     displacement = asset.meshes[0].material.displacement
     if displacement is not None and out.suffix.lower() == ".obj":
-        with replacing(out.with_name(f"{out.stem}_displacement.png")) as temporary:
-            temporary.write_bytes(height_png(displacement))
+        out.with_name(f"{out.stem}_displacement.png").write_bytes(height_png(displacement))

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from appearance_opt.config import CommonOptions
     from appearance_opt.fit.checkpoint import Checkpointer
     from appearance_opt.fit.loop import Progress
+    from appearance_opt.interrupts import Interrupts
     from appearance_opt.jobs.start import Start
     from appearance_opt.reference.base import Reference
     from appearance_opt.views import ViewSampler
@@ -94,6 +95,7 @@ def fit_start(
     options: CommonOptions,
     watch: Stopwatch,
     *,
+    interrupts: Interrupts,
     laplacian: float = 0.0,
     relative: bool = True,
     progress: Progress | None = None,
@@ -103,8 +105,9 @@ def fit_start(
     """Fit what ``options.fit`` names, from ``start``, within what is left of the budget on ``watch``.
 
     The model is left at its best state by held-out PSNR; so it is when the fit diverged, which is returned
-    rather than raised: the state is worth writing first.
+    rather than raised: the state is worth writing first. From here on ``interrupts`` protect the result.
     """
+    interrupts.protect()
     o = options
     width = point_width(o.resolution, o.texture_size)
     pool = ReferencePool(reference, sampler, o.pool, o.views, o.resolution, POOL_SAMPLES, width, o.reuse)
@@ -137,7 +140,7 @@ def fit_start(
     )
     error = None
     try:
-        fitted = fit(model, pool, validation, fit_options, progress, checkpointer)
+        fitted = fit(model, pool, validation, fit_options, progress, checkpointer, interrupts.asked)
     except DivergedError as diverged:
         error, fitted = diverged, FitResult()
     watch.lap("fit")

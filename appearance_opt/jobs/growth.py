@@ -10,20 +10,20 @@ an atlas of full size.
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from appearance_opt.config import with_values
 from appearance_opt.errors import InputError
-from appearance_opt.fit import archive
 from appearance_opt.fit.loop import FitOptions, FitResult, fit
 from appearance_opt.fit.model import Model, Rates
 from appearance_opt.fit.validation import Validation
 from appearance_opt.initial.atlas import unwrap
 from appearance_opt.initial.decimate import decimate
 from appearance_opt.initial.sphere import random_maps, sphere
+from appearance_opt.interrupts import Interrupts
 from appearance_opt.jobs.fitting import VALIDATION_VIEWS, clean_maps
 from appearance_opt.jobs.start import Start, transferred
 from appearance_opt.latent.export import to_asset
@@ -33,8 +33,7 @@ from appearance_opt.reference.pool import ReferencePool
 from appearance_opt.views import VALIDATION
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
-    from pathlib import Path
+    from collections.abc import Mapping
 
     from numpy.typing import NDArray
 
@@ -73,11 +72,12 @@ MENDING = 0.5
 
 @dataclass(frozen=True)
 class Effort:
-    """How long the shape is fitted (whichever comes first), and who is told."""
+    """How long the shape is fitted (whichever comes first), who is told, and who may end it early."""
 
     seconds: float | None
     steps: int | None
     progress: Progress | None = None
+    interrupts: Interrupts = field(default_factory=Interrupts)
 
 
 def grown(
@@ -136,7 +136,8 @@ def _shaped(
         background=options.background_color(),
         seed=options.seed,
     )
-    result = fit(model, pool, validation, fit_options, effort.progress)
+    effort.interrupts.protect()
+    result = fit(model, pool, validation, fit_options, effort.progress, stop=effort.interrupts.asked)
     log.info("shape by preconditioned steps: %d of them, %.2f dB", result.steps, result.curve[-1].psnr)
     return model, result
 
@@ -162,38 +163,3 @@ def stretched(ball: LatentMesh, sampler: ViewSampler) -> LatentMesh:
         # not too flat: steps are limited, and opposite sides must not pass through each other
         centre, half = (low + high) / 2, INSIDE * np.maximum((high - low) / 2, 0.1 * sampler.radius)
     return replace(ball, positions=(ball.positions * half + centre).astype(np.float32))
-
-
-def kept(path: Path, fingerprint: str, make: Callable[[], tuple[Start, bool]]) -> tuple[Start, bool]:
-    """A start from ``path``, or made and written there: a resumed fit must go on from the very same one. Raises
-    InputError when what is there is damaged or belongs to a job of another ``fingerprint``."""
-    if path.exists():
-        try:
-            return _start(archive.read(path, fingerprint)), False
-        except archive.UNREADABLE as error:
-            raise InputError(f"{path}: not a usable start ({error}); delete it to begin anew") from error
-    start, interrupted = make()
-    arrays = {f"map/{name}": np.asarray(value) for name, value in start.maps.items()}
-    for prefix, mesh in (("", start.mesh), ("finest/", start.finest)):
-        if mesh is not None:
-            arrays.update({prefix + n: getattr(mesh, n) for n in _MESH if getattr(mesh, n) is not None})
-    arrays.update({name: np.asarray(getattr(start, name)) for name in ("known", "grown", "relative", "levels")})
-    archive.write(path, fingerprint, arrays)
-    return start, interrupted
-
-
-_MESH = ("positions", "faces", "frame_vertex", "frame_faces", "uvs", "single")
-
-
-def _start(arrays: dict[str, NDArray]) -> Start:
-    maps = {k[4:]: v if v.ndim else float(v) for k, v in arrays.items() if k.startswith("map/")}
-    mesh, finest = (
-        LatentMesh(**{n: arrays[prefix + n] for n in _MESH if prefix + n in arrays})
-        if prefix + "faces" in arrays
-        else None
-        for prefix in ("", "finest/")
-    )
-    if mesh is None:
-        raise KeyError("faces")
-    levels = tuple(int(level) for level in arrays["levels"])
-    return Start(mesh, maps, bool(arrays["relative"]), arrays["known"], levels, finest, bool(arrays["grown"]))

@@ -6,15 +6,18 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from appearance_opt.asset import save
-from appearance_opt.jobs.paths import check_paths, check_replaces
-from appearance_opt.jobs.simplify import SimplifyResult, loaded
+from appearance_opt.interrupts import Interrupts
+from appearance_opt.jobs.paths import Outputs
+from appearance_opt.jobs.simplify import SimplifyResult, loaded, write_result
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     from appearance_opt.asset.types import Asset
     from appearance_opt.config import BakeOptions
     from appearance_opt.fit.loop import Progress
     from appearance_opt.jobs.bake import BakeJob
+    from appearance_opt.jobs.fitting import Stopwatch
 
 LAPLACIAN = 0.25
 """Weight of the Laplacian, as by default in a simplification."""
@@ -30,40 +33,57 @@ def joint(
     progress: Progress | None = None,
     variants: dict[str, str] | None = None,
     began: float | None = None,
+    inputs: Iterable[str | Path] = (),
 ) -> SimplifyResult:
     """Fit base shape, displacement, normals and material of ``low`` to ``high`` and write the result to ``out``
     (None: do not write). LOW keeps its topology and its texture coordinates; each kind of detail goes where it
-    is represented best. Raises AppearanceError."""
-    from appearance_opt.jobs.bake import BakeJob, loaded_low, split_pair
-    from appearance_opt.jobs.displaced import require_memory, write_companion, write_levels
-    from appearance_opt.jobs.fitting import Stopwatch, conclude
+    is represented best. ``inputs``: other files that must not be replaced. Raises AppearanceError."""
+    from appearance_opt.jobs.fitting import Stopwatch
 
     watch = Stopwatch(began)
-    for source in (high, low):
-        check_paths(source, out, report)
+    outputs = Outputs.of(out, options, report=report)
+    outputs.check()
+    outputs.check_sources(high, low, *inputs)
+    with outputs.held(), Interrupts() as interrupts:
+        return _joined(high, low, outputs, options, progress, variants, watch, interrupts)
+
+
+def _joined(
+    high: str | Path | Asset,
+    low: str | Path | Asset,
+    outputs: Outputs,
+    options: BakeOptions,
+    progress: Progress | None,
+    variants: dict[str, str] | None,
+    watch: Stopwatch,
+    interrupts: Interrupts,
+) -> SimplifyResult:
+    from appearance_opt.jobs.bake import BakeJob, loaded_low, split_pair
+    from appearance_opt.jobs.displaced import require_memory
+    from appearance_opt.jobs.fitting import conclude
+
     heavy, light = loaded(high, options, variants), loaded_low(low, options)
-    check_replaces((heavy, light), out)
+    outputs.check_inputs(heavy, light)
+    outputs.check_room(light.triangle_count, options)
     parts = split_pair(high, heavy, low, light)
     require_memory(parts[1].fitted.triangle_count, options)
     watch.lap("load")
-    job = BakeJob(*parts, options, watch)
-    result = _fitted(job, options, progress, report is not None)
-    if out is not None:
-        save(result.asset, out)
-        write_companion(result.asset, Path(out))
-        if options.write_tessellated:
-            write_levels(result.tessellated, Path(out))
+    job = BakeJob(*parts, options, watch, interrupts)
+    result = _fitted(job, options, progress, outputs.report is not None)
+    if outputs.out is not None:
+        write_result(result, outputs.out, options)
         watch.lap("write")
+    interrupts.release()
     if result.error is not None:
         raise result.error
 
     def write_report() -> None:
         from appearance_opt.jobs.report import write_simplify_report
 
-        assert report is not None
-        write_simplify_report(Path(report), job.high, result, *job.view_of_all(), options)
+        assert outputs.report is not None
+        write_simplify_report(outputs.report, job.high, result, *job.view_of_all(), options)
 
-    conclude(result, watch, None if report is None else write_report)
+    conclude(result, watch, None if outputs.report is None else write_report)
     return result
 
 
@@ -91,6 +111,7 @@ def _fitted(job: BakeJob, options: BakeOptions, progress: Progress | None, with_
         start,
         replace(options, fit=parts),
         job.watch,
+        interrupts=job.interrupts,
         laplacian=LAPLACIAN,
         progress=progress,
         with_report=with_report,

@@ -2,52 +2,193 @@
 
 from __future__ import annotations
 
+import os
+import shutil
+import tempfile
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from glob import escape
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from appearance_opt.asset import check_folder, check_writable
+from appearance_opt.asset.paths import MAX_NAME
 from appearance_opt.errors import InputError
+from appearance_opt.fit.archive import FILES as CHECKPOINT_FILES
+from appearance_opt.lock import lock_path, locked
+from appearance_opt.publish import recover
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Iterator
 
     from appearance_opt.asset.types import Asset
+    from appearance_opt.config import CommonOptions
+
+REPORT_FILES = ("report.html", "report.json", "view[0-9]*_*.png", "map_*.png")
+"""Patterns of the names in a report."""
+
+SUFFIX = "_M000_" + MAX_NAME * "x" + "_displacement.png"
+"""The longest that writers add to the stem of a result, about, where they name pictures after materials."""
+
+BYTES_PER_TRIANGLE, BYTES_PER_TEXEL = 150, 12
+"""Of a result: vertices, their attributes and indices as text or binary; four maps of three bytes, not compressed."""
+
+STATE_BYTES_PER_TEXEL = 400
+"""Of a checkpoint: nine channels of a start, and of a fit value, two moments, mean and best value of each, twice while
+one state takes the place of another."""
+
+REPORT_BYTES = 20 << 20
 
 
-def check_paths(
-    source: str | Path | Asset | None,
-    out: str | Path | None,
-    *folders: str | Path | None,
-) -> None:
-    """Raise InputError if results could not be written, or would replace the input. ``folders``: others that
-    will be written to (report, checkpoint, textures)."""
-    if out is not None:
-        check_writable(Path(out))
-        check_folder(Path(out).parent)
-        if isinstance(source, (str, Path)) and Path(out).resolve() == Path(source).resolve():
-            raise InputError(f"{out}: is the input itself, which is never changed; choose another name")
-    for folder in folders:
-        if folder is not None:
-            check_folder(Path(folder))
+@dataclass(frozen=True)
+class Outputs:
+    """All that a job writes. ``out``: the result, with what its writer puts beside it; ``levels``: tessellation levels
+    that are written beside it, too; ``report``, ``checkpoint``, ``textures``: folders."""
+
+    out: Path | None = None
+    report: Path | None = None
+    checkpoint: Path | None = None
+    textures: Path | None = None
+    levels: tuple[int, ...] = ()
+
+    @classmethod
+    def of(
+        cls,
+        out: str | Path | None,
+        options: CommonOptions | None = None,
+        *,
+        report: str | Path | None = None,
+        checkpoint: str | Path | None = None,
+        textures: str | Path | None = None,
+    ) -> Outputs:
+        """From what a job was given. ``options``: do they ask for tessellated meshes?"""
+        levels = options.levels() if options is not None and options.write_tessellated else ()
+        out, report, checkpoint, textures = (
+            None if path is None else Path(path) for path in (out, report, checkpoint, textures)
+        )
+        return cls(out, report, checkpoint, textures, levels)
+
+    @property
+    def results(self) -> tuple[Path, ...]:
+        """Files in the format of the result."""
+        if self.out is None:
+            return ()
+        return self.out, *(level_path(self.out, level) for level in self.levels)
+
+    @property
+    def folders(self) -> tuple[Path, ...]:
+        """Folders with other files."""
+        return tuple(p for p in (self.report, self.checkpoint, self.textures) if p is not None)
+
+    def patterns(self) -> list[tuple[Path, str]]:
+        """(folder, pattern of names) of all files that could be written or replaced."""
+        out = []
+        for path in self.results:
+            out += [(path.parent, name) for name in (escape(path.name), *_beside(path))]
+            out += [(path.with_name(path.stem + folder), "*") for folder in ("_textures", "_maps")]
+        if self.report is not None:
+            out += [(self.report, name) for name in REPORT_FILES]
+        if self.checkpoint is not None:
+            out += [(self.checkpoint, name) for name in CHECKPOINT_FILES]
+        if self.textures is not None and self.out is not None:
+            out.append((self.textures, f"{escape(self.out.stem)}_*"))
+        return out
+
+    def check(self) -> None:
+        """Raise InputError if something could not be written where it is to be."""
+        for path in self.results:
+            check_writable(path)
+            check_folder(path.parent)
+            longest = (
+                [path.with_suffix("").name + SUFFIX] if path.suffix.lower() == ".obj" else [path.stem + "_textures"]
+            )
+            _check_names(path, [path.name, *longest])
+        for folder in self.folders:
+            check_folder(folder)
+            _check_names(folder, [folder.name])
+
+    def check_sources(self, *sources: object) -> None:
+        """Raise InputError if writing could replace a file that the user named (others than paths are passed over)."""
+        files = [Path(s) for s in sources if isinstance(s, (str, Path))]
+        named = {path.resolve() for path in self.results}
+        if any(file.resolve() in named for file in files):
+            raise InputError(f"{self.out}: is the input itself, which is never changed; choose another name")
+        self._check_files(files)
+
+    def check_inputs(self, *assets: Asset | None) -> None:
+        """Raise InputError if writing could replace a file that an asset was read from."""
+        self._check_files(file for asset in assets if asset is not None for file in asset.files)
+
+    def _check_files(self, files: Iterable[Path]) -> None:
+        patterns = [(folder.resolve(), pattern) for folder, pattern in self.patterns()]
+        for file in files:
+            # a link would be replaced itself, not what it leads to
+            for at in {file.parent.resolve() / file.name, file.resolve()}:
+                if any(at.parent == folder and fnmatchcase(at.name, name) for folder, name in patterns):
+                    raise InputError(
+                        f"{self.out or self.report}: writing it could replace '{file}', which the input refers to "
+                        "and which is never changed; choose another name or folder"
+                    )
+
+    def check_room(self, triangles: int, options: CommonOptions | None) -> None:
+        """Raise InputError if a result of so many triangles would not fit on the disks, as far as can be told."""
+        texels = 0 if options is None else options.texture_size**2
+        need: list[tuple[Path, int]] = [(Path(tempfile.gettempdir()), 3 * texels)]
+        for path, level in zip(self.results, (0, *self.levels), strict=False):
+            size = BYTES_PER_TRIANGLE * triangles * 4**level + BYTES_PER_TEXEL * texels
+            need.append((path.parent, size))
+        if self.textures is not None:
+            need.append((self.textures, BYTES_PER_TEXEL * texels))
+        if self.report is not None:
+            need.append((self.report, REPORT_BYTES))
+        if self.checkpoint is not None:
+            need.append((self.checkpoint, STATE_BYTES_PER_TEXEL * texels))
+        disks: dict[int, tuple[Path, int]] = {}
+        for folder, size in need:
+            there = next(p for p in (folder, *folder.resolve().parents) if p.exists())
+            device = there.stat().st_dev
+            disks[device] = (disks.get(device, (there, 0))[0], disks.get(device, (there, 0))[1] + size)
+        for there, size in disks.values():
+            free = shutil.disk_usage(there).free
+            if size > free:
+                raise InputError(
+                    f"{there}: what is to be written takes up to {size / 2**20:.0f} MiB, and {free / 2**20:.0f} MiB "
+                    "are free on that disk; make room, or choose another folder or a smaller --texture-size"
+                )
+
+    @contextmanager
+    def held(self) -> Iterator[None]:
+        """While the job runs, no other run may write there. Raises InputError if one does. What a killed run has left
+        half done there is undone first."""
+        with ExitStack() as stack:
+            for target in dict.fromkeys(p.resolve() for p in (self.out, self.report, self.checkpoint) if p is not None):
+                stack.enter_context(locked(target))
+            for folder in {p.resolve().parent for p in (self.out, self.report) if p is not None}:
+                recover(folder)
+            if self.textures is not None and self.textures.is_dir():
+                recover(self.textures)
+            yield
 
 
-def check_replaces(assets: Iterable[Asset], out: str | Path | None, textures: str | Path | None = None) -> None:
-    """Raise InputError if writing ``out``, or loose maps into ``textures``, could replace a file that one of the assets
-    was read from: a material file, a buffer, a picture."""
-    if out is None:
+def level_path(out: Path, level: int) -> Path:
+    """Where the mesh of a tessellation level goes: ``<stem>_level<k><suffix>`` beside ``out``."""
+    return out.with_name(f"{out.stem}_level{level}{out.suffix}")
+
+
+def _check_names(path: Path, names: list[str]) -> None:
+    """Raise InputError if one of ``names``, or the name of its lock, is longer than the file system takes."""
+    there = next((p for p in path.resolve().parents if p.exists()), Path("/"))
+    try:
+        most = os.pathconf(there, "PC_NAME_MAX")
+    except (OSError, ValueError):
         return
-    out = Path(out)
-    written = [(out.parent, name) for name in (escape(out.name), *_beside(out))]
-    written += [(out.with_name(out.stem + folder), "*") for folder in ("_textures", "_maps")]
-    if textures is not None:
-        written.append((Path(textures), f"{escape(out.stem)}_*"))
-    for file in (file for asset in assets for file in asset.files):
-        if any(file.parent == folder.resolve() and fnmatchcase(file.name, name) for folder, name in written):
+    for name in (*names, lock_path(path).name):
+        if len(os.fsencode(name)) > most:
+            excess = len(os.fsencode(name)) - most
             raise InputError(
-                f"{out}: writing it could replace '{file}', which the input refers to and which is never changed; "
-                "choose another name or folder"
+                f"{path.parent / path.name[:40]}...: the name is too long by {excess} bytes for what is written under "
+                "it or beside it; choose a shorter one"
             )
 
 

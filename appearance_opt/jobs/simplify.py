@@ -2,26 +2,26 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 import logging
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from appearance_opt import __version__, backend
-from appearance_opt.asset import load, save
+from appearance_opt.asset import load, write
 from appearance_opt.asset.origin import ZERO
-from appearance_opt.asset.types import Texture
-from appearance_opt.config import CommonOptions, SimplifyOptions, as_dict, with_values
+from appearance_opt.config import CommonOptions, SimplifyOptions, with_values
+from appearance_opt.digest import digest
 from appearance_opt.errors import DivergedError, InputError
+from appearance_opt.interrupts import Interrupts
 from appearance_opt.jobs.parts import split
-from appearance_opt.jobs.paths import check_paths, check_replaces
+from appearance_opt.jobs.paths import Outputs, level_path
+from appearance_opt.publish import publication
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterable
 
     from numpy.typing import NDArray
 
@@ -76,36 +76,61 @@ def simplify(
     progress: Progress | None = None,
     variants: dict[str, str] | None = None,
     began: float | None = None,
+    inputs: Iterable[str | Path] = (),
 ) -> SimplifyResult:
     """Simplify ``source`` (a path or an asset) and write the result to ``out`` (None: do not write).
 
     ``report``: folder for pictures, metrics and report.html. ``checkpoint``: folder in which the state is kept
     every few seconds; with ``resume`` a run goes on from there. ``variants``: USD variant selections. ``began``:
-    ``time.perf_counter()`` at which the time budget began, if before this call. Transparent meshes of the source pass
-    into the result as they are (see ``jobs.parts``). Ctrl-C ends the fit early and still
-    writes the best state so far; once the result is written it ends the report. Raises AppearanceError.
+    ``time.perf_counter()`` at which the time budget began, if before this call. ``inputs``: other files that must not
+    be replaced. Transparent meshes of the source pass into the result as they are (see ``jobs.parts``). Ctrl-C ends the
+    fit early and still writes the best state so far, the third one gives it up; once the result is written it ends the
+    report. Raises AppearanceError.
     """
-    from appearance_opt.jobs.displaced import write_companion, write_levels
-    from appearance_opt.jobs.fitting import Stopwatch, conclude
+    from appearance_opt.jobs.fitting import Stopwatch
 
     watch = Stopwatch(began)
-    check_paths(source, out, report, checkpoint)
-    if Path(options.init).suffix:
-        check_paths(options.init, out)
+    outputs = Outputs.of(out, options, report=report, checkpoint=checkpoint)
+    outputs.check()
+    first = options.init if Path(options.init).suffix else None
+    outputs.check_sources(source, first, *inputs)
+    if resume and checkpoint is None:
+        raise InputError("--resume needs --checkpoint DIR")
+    with outputs.held(), Interrupts() as interrupts:
+        return _simplified(source, outputs, options, resume, progress, variants, watch, interrupts)
+
+
+def _simplified(
+    source: str | Path | Asset,
+    outputs: Outputs,
+    options: SimplifyOptions,
+    resume: bool,
+    progress: Progress | None,
+    variants: dict[str, str] | None,
+    watch: Stopwatch,
+    interrupts: Interrupts,
+) -> SimplifyResult:
+    from appearance_opt.jobs.fitting import conclude
+
     asset = loaded(source, options, variants)
-    check_replaces([asset], out)
+    first = loaded_start(options)
+    outputs.check_inputs(asset, first)
+    outputs.check_room(options.triangles or round((options.ratio or 1.0) * asset.triangle_count), options)
     parts = split(asset, str(source) if isinstance(source, (str, Path)) else asset.name, "simplify")
     watch.lap("load")
     backend.select(options.device)
-    run = _Job(parts, options, watch, progress, _checkpointer(asset, options, checkpoint, resume), report is not None)
+    checkpointer = None
+    if outputs.checkpoint is not None:
+        from appearance_opt.fit.checkpoint import Checkpointer
+
+        job = fingerprint(options, asset, first)
+        checkpointer = Checkpointer(outputs.checkpoint, job, resume, CHECKPOINT_SECONDS)
+    run = _Job(parts, first, options, watch, progress, checkpointer, interrupts, outputs.report is not None)
     result = run.fit()
-    if out is not None:
-        save(result.asset, out)
-        if options.displaced:
-            write_companion(result.asset, Path(out))
-        if options.write_tessellated:
-            write_levels(result.tessellated, Path(out))
+    if outputs.out is not None:
+        write_result(result, outputs.out, options)
         watch.lap("write")
+    interrupts.release()
     if result.error is not None:
         raise result.error
     frame, sampler = run.frame, run.sampler
@@ -118,11 +143,24 @@ def simplify(
 
         # the report uploads what it draws: a heavy reference need not be held twice
         backend.release_memory()
-        assert report is not None
-        write_simplify_report(Path(report), parts.whole, result, sampler, frame, options)
+        assert outputs.report is not None
+        write_simplify_report(outputs.report, parts.whole, result, sampler, frame, options)
 
-    conclude(result, watch, None if report is None else write_report)
+    conclude(result, watch, None if outputs.report is None else write_report)
     return result
+
+
+def write_result(result: SimplifyResult, out: Path, options: CommonOptions) -> None:
+    """The result and what belongs to it, all of it or nothing. Raises OSError."""
+    from appearance_opt.jobs.displaced import write_companion
+
+    with publication() as together:
+        write(result.asset, together.place(out))
+        if options.displaced:
+            write_companion(result.asset, together.place(out))
+        if options.write_tessellated:
+            for level, asset in result.tessellated.items():
+                write(asset, together.place(level_path(out, level)))
 
 
 def loaded(source: str | Path | Asset, options: CommonOptions, variants: dict[str, str] | None = None) -> Asset:
@@ -133,25 +171,34 @@ def loaded(source: str | Path | Asset, options: CommonOptions, variants: dict[st
     return load(source, refine=options.refine, variants=variants, **given)  # type: ignore[arg-type]
 
 
+def loaded_start(options: SimplifyOptions) -> Asset | None:
+    """The asset that ``--init`` names; None if it names none. Its own maps are not used: it may lack them."""
+    if not Path(options.init).suffix:
+        return None
+    return load(options.init, refine=options.refine, missing_textures="ignore", root=options.root, keep_layout=True)
+
+
 class _Job:
     """The reference, its frame and the start; then the fit."""
 
     def __init__(
         self,
         parts: Parts,
+        first: Asset | None,
         options: SimplifyOptions,
         watch: Stopwatch,
         progress: Progress | None,
         checkpointer: Checkpointer | None,
+        interrupts: Interrupts,
         with_report: bool,
     ) -> None:
         from appearance_opt.jobs.fitting import seconds_left
         from appearance_opt.jobs.growth import grown, mended
-        from appearance_opt.jobs.start import budget, loaded_mesh, make_start, sided, transferred
+        from appearance_opt.jobs.start import atlas_of, budget, make_start, sided, transferred
         from appearance_opt.reference.mesh import MeshReference
         from appearance_opt.views import ViewSampler, framing
 
-        self.options, self.watch = options, watch
+        self.options, self.watch, self.interrupts = options, watch, interrupts
         self.progress, self.checkpointer, self.with_report = progress, checkpointer, with_report
         self.parts, asset = parts, parts.fitted
         self.notes = [
@@ -174,9 +221,8 @@ class _Job:
             left = seconds_left(options, watch, with_report)
             self.start = self._kept(lambda: make_start(self.reference, options, self.sampler, triangles, left))
         else:
-            mesh, notes = loaded_mesh(
-                Path(options.init), self.frame, asset.triangle_count, options, self.reference.single
-            )
+            assert first is not None
+            mesh, notes = atlas_of(first, self.frame, asset.triangle_count, options, self.reference.single)
             self.notes += notes
             if options.relative is False and "shape" in options.fit and not options.displaced:
                 self.start = self._shaped(lambda effort: mended(self.reference, self.sampler, options, mesh, effort))
@@ -188,32 +234,29 @@ class _Job:
         watch.lap("start")
 
     def _kept(self, make: Callable[[], Start]) -> Start:
-        """A start that a resumed run takes from beside its checkpoint: made again, it could be another one, as the time
-        that is left decides how often triangles are moved."""
-        from appearance_opt.jobs.growth import kept
+        """A start that a resumed run takes from beside its checkpoint."""
+        return self._begun(lambda: (make(), False))[0]
+
+    def _begun(self, make: Callable[[], tuple[Start, bool]]) -> tuple[Start, bool]:
+        from appearance_opt.jobs.start import Start
+        from appearance_opt.latent.latent import LatentMesh
 
         if self.checkpointer is None:
             return make()
-        return kept(self.checkpointer.start_path, self.checkpointer.fingerprint, lambda: (make(), False))[0]
+        return self.checkpointer.start(make, Start, LatentMesh)
 
     def _shaped(self, make_within: Callable[[Effort], tuple[Start, bool]]) -> Start:
         """A start whose shape is fitted first, in a part of the time or the steps."""
         from appearance_opt.jobs.fitting import seconds_left
-        from appearance_opt.jobs.growth import SHARE, Effort, kept
+        from appearance_opt.jobs.growth import SHARE, Effort
 
         o = self.options
         seconds = seconds_left(o, self.watch, self.with_report)
         steps = 1000 if o.steps is None and seconds is None else o.steps
         share = None if seconds is None else SHARE * seconds
-        effort = Effort(share, None if steps is None else round(SHARE * steps), self.progress)
+        effort = Effort(share, None if steps is None else round(SHARE * steps), self.progress, self.interrupts)
 
-        def make() -> tuple[Start, bool]:
-            return make_within(effort)
-
-        if self.checkpointer is None:
-            start, interrupted = make()
-        else:
-            start, interrupted = kept(self.checkpointer.start_path, self.checkpointer.fingerprint, make)
+        start, interrupted = self._begun(lambda: make_within(effort))
         if interrupted:  # Ctrl-C ends both fits
             self.options = with_values(o, steps=0)
         elif steps is not None:
@@ -234,6 +277,7 @@ class _Job:
             self.start,
             o,
             self.watch,
+            interrupts=self.interrupts,
             laplacian=o.laplacian,
             relative=self.start.relative if o.relative is None else o.relative,
             progress=self.progress,
@@ -297,38 +341,8 @@ def support(positions: NDArray, count: int = 256) -> NDArray[np.float64]:
     return positions[np.unique(best)].astype(np.float64)
 
 
-def _checkpointer(
-    asset: Asset, options: SimplifyOptions, folder: str | Path | None, resume: bool
-) -> Checkpointer | None:
-    if folder is None:
-        if resume:
-            raise InputError("--resume needs --checkpoint DIR")
-        return None
-    from appearance_opt.fit.checkpoint import Checkpointer
-
-    return Checkpointer(Path(folder), _fingerprint(asset, options), resume, CHECKPOINT_SECONDS)
-
-
-def _fingerprint(asset: Asset, options: SimplifyOptions) -> str:
-    """Hash of all that a result depends on: options, version, origin, every array of every mesh, every
-    field of every material."""
-    digest = hashlib.sha256(json.dumps([__version__, as_dict(options)], sort_keys=True).encode())
-
-    def add(value: object) -> None:
-        if isinstance(value, np.ndarray):
-            digest.update(repr((value.shape, str(value.dtype))).encode())
-            digest.update(np.ascontiguousarray(value).tobytes())
-        elif isinstance(value, Texture):
-            for f in fields(value):
-                add(getattr(value, f.name))
-        else:
-            digest.update(repr(value).encode())
-
-    add(asset.origin)
-    for mesh in asset.meshes:
-        for name in ("positions", "faces", "normals", "uvs", "tangents", "colors"):
-            add(getattr(mesh, name))
-    for material in {id(m.material): m.material for m in asset.meshes}.values():
-        for f in fields(material):
-            add(getattr(material, f.name))
-    return digest.hexdigest()
+def fingerprint(options: SimplifyOptions, asset: Asset, first: Asset | None) -> str:
+    """Hash of all that a result depends on: version, options, and everything that was read, but for where it was read
+    from and what was said about it. ``first``: the mesh of ``--init``."""
+    read = [None if a is None else replace(a, files=(), notes=()) for a in (asset, first)]
+    return digest([__version__, options, *read])

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import time
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -28,6 +27,7 @@ from appearance_opt.views import START, VISIBILITY
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from appearance_opt.asset.types import Asset
     from appearance_opt.config import SimplifyOptions
     from appearance_opt.reference.mesh import MeshReference
     from appearance_opt.views import ViewSampler
@@ -214,28 +214,25 @@ def sided(start: Start, single: NDArray[np.bool_]) -> Start:
     return replace(start, mesh=mesh, finest=finest)
 
 
-def loaded_mesh(
-    path: Path,
+def atlas_of(
+    given: Asset,
     frame: tuple[tuple[float, float, float], float],
     available: int,
     options: SimplifyOptions,
     sides: NDArray[np.bool_],
 ) -> tuple[LatentMesh, list[str]]:
-    """(the mesh of a file, moved to a ``frame`` (centre, scale), with a new atlas; notes). ``available``: triangles of
-    the reference; ``sides``: those that are seen from their front only. If either all or none are, so it is with the
-    mesh; else its file decides. Transparent parts are left out, for those of the input pass into the result. Raises
-    InputError when it has more triangles than were asked for."""
-    from appearance_opt.asset import load
+    """(the mesh that ``options.init`` names, moved to a ``frame`` (centre, scale), with a new atlas; notes).
+    ``available``: triangles of the reference; ``sides``: those that are seen from their front only. If either all or
+    none are, so it is with the mesh; else its file decides. Transparent parts are left out, for those of the input pass
+    into the result. Raises InputError when it has more triangles than were asked for."""
     from appearance_opt.asset.normals import weld
     from appearance_opt.asset.sides import single_sided
 
-    # its own maps are not used: it may lack them
-    given = load(path, refine=options.refine, missing_textures="ignore", root=options.root, keep_layout=True)
-    parts = split(given, f"--init {path}", "start from")
+    parts = split(given, f"--init {options.init}", "start from")
     asset = parts.fitted
     most = None if options.triangles is None and options.ratio is None else budget(options, available)
     if most is not None and asset.triangle_count > most:
-        raise InputError(f"--init {path}: has {asset.triangle_count} triangles, more than the {most} asked for")
+        raise InputError(f"--init {options.init}: has {asset.triangle_count} triangles, more than the {most} asked for")
     offsets = np.cumsum([0] + [len(m.positions) for m in asset.meshes[:-1]])
     p = np.concatenate([m.positions for m in asset.meshes]).astype(np.float64)
     f = np.concatenate([m.faces + o for m, o in zip(asset.meshes, offsets, strict=True)])
