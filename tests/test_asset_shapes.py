@@ -219,3 +219,61 @@ def test_colours_with_and_without_alpha_are_drawn_together() -> None:
     both = tuple(replace(mesh, colors=np.ones((count, width), np.float32)) for width in (3, 4))
     merged = merge(replace(ball, meshes=both), [0, 0], False)
     np.testing.assert_array_equal(merged.colors, np.ones((2 * count, 4)))
+
+
+FACE = """#usda 1.0
+(upAxis = "Y"
+metersPerUnit = 1)
+def SkelRoot "root"
+{
+    def Skeleton "skeleton" (prepend apiSchemas = ["SkelBindingAPI"])
+    {
+        rel skel:animationSource = </root/animation>
+    }
+    def SkelAnimation "animation"
+    {
+        uniform token[] blendShapes = ["up", "unused", "side"]
+        float[] blendShapeWeights = [0.5, 3, 0.25]
+        float[] blendShapeWeights.timeSamples = { 1: [9, 9, 9] }
+    }
+    def Mesh "m" (prepend apiSchemas = ["SkelBindingAPI"])
+    {
+        int[] faceVertexCounts = [3]
+        int[] faceVertexIndices = [0, 1, 2]
+        point3f[] points = [(0, 0, 0), (1, 0, 0), (0, 1, 0)]
+        normal3f[] normals = [(0, 0, 1), (0, 0, 1), (0, 0, 1)] (interpolation = "HOW")
+        uniform token subdivisionScheme = "none"
+        uniform token[] skel:blendShapes = ["side", "up"]
+        rel skel:blendShapeTargets = [</root/m/side>, </root/m/up>]
+        rel skel:skeleton = </root/skeleton>
+        def BlendShape "up"
+        {
+            vector3f[] offsets = [(0, 0, 2)]
+            vector3f[] normalOffsets = [(2, 0, 0)]
+            int[] pointIndices = [1]
+        }
+        def BlendShape "side"
+        {
+            vector3f[] offsets = [(4, 0, 0), (4, 0, 0), (4, 0, 0)]
+            vector3f[] inbetweens:half = [(0, 0, 0), (0, 0, 0), (0, 8, 0)] (weight = 0.5)
+        }
+    }
+}
+"""
+
+
+@pytest.mark.parametrize("how", ["vertex", "faceVarying"])
+def test_default_weights_of_blend_shapes_are_part_of_the_shape(tmp_path: Path, how: str) -> None:
+    path = tmp_path / "x.usda"
+    path.write_text(FACE.replace("HOW", how))
+    asset = load(path)
+    mesh = asset.meshes[0]
+    corner = mesh.faces[0]
+    # the weight 0.25 of "side" is half of its in-between shape
+    np.testing.assert_allclose(mesh.positions[corner], [[0, 0, 0], [1, 0, 1], [0, 5, 0]], atol=1e-6)
+    tilted = np.array([1, 0, 1]) / 2**0.5
+    np.testing.assert_allclose(mesh.normals[corner], [[0, 0, 1], tilted, [0, 0, 1]], atol=1e-6)
+    assert any("default weights" in note for note in asset.notes)
+    path.write_text(FACE.replace("HOW", how).replace("float[] blendShapeWeights = [0.5, 3, 0.25]", ""))
+    mesh = load(path).meshes[0]
+    np.testing.assert_allclose(mesh.positions[mesh.faces[0]], [[0, 0, 0], [1, 0, 0], [0, 1, 0]])

@@ -22,6 +22,7 @@ from appearance_opt.asset.polygons import Polygons, triangulate
 from appearance_opt.asset.rows import ranked, unique_rows
 from appearance_opt.asset.subdivide import Sharpness, catmull_clark
 from appearance_opt.asset.types import Asset, Contents, Mesh
+from appearance_opt.asset.usd_blend import blended
 from appearance_opt.asset.usd_guard import check_usd
 from appearance_opt.asset.usd_materials import MaterialReader
 from appearance_opt.errors import InputError
@@ -231,8 +232,6 @@ class _Reader:
 
         world = self.cache.GetLocalToWorldTransform(prim)
         binding = UsdSkel.BindingAPI(prim)
-        if binding.GetBlendShapesAttr().Get():
-            self.note(f"'{prim.GetPath()}': blend shapes ignored")
         if not binding.GetJointIndicesPrimvar().HasValue():
             return world
         self.note(f"'{prim.GetPath()}': the bind pose is kept, skinning dropped")
@@ -355,9 +354,20 @@ class _Reader:
             self.note(f"'{prim.GetPath()}': faces with fewer than three corners ignored")
         polygons = Polygons(counts, indices)
         face_ids = np.arange(len(counts))
+        shape = blended(prim, points)
+        if shape is not None:
+            points = shape[0]
+            told = "blend shapes: the shape of their default weights is kept, others are dropped"
+            self.note(f"'{prim.GetPath()}': {told}")
         values = {"points": (points, polygons)}
         for name, (value, where) in self._primvars(prim, mesh, polygons).items():
             values[name] = (value, where)
+        if shape is not None and "normals" in values and shape[1].any():
+            normals, where = values["normals"]
+            point = np.zeros(len(normals), np.int64)
+            point[where.indices] = polygons.indices
+            if (point[where.indices] == polygons.indices).all():  # none is shared by several points
+                values["normals"] = normals + shape[1][point], where
         scheme = str(mesh.GetSubdivisionSchemeAttr().Get())
         if scheme in ("none", "bilinear") and "normals" not in values and not self.keep_layout:
             values["normals"] = _facets(points, polygons, flipped)
