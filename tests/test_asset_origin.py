@@ -155,9 +155,16 @@ def test_assets_of_different_origins_are_compared_where_they_are() -> None:
     check_place(first, second)
     with pytest.raises(InputError, match="do not lie in one place"):
         check_place(first, replace(first, origin=(0, 0, 0)))
-    same = compare(first, second, views=2, resolution=48, samples=4).metrics
-    assert same.psnr_covered > 50
-    assert same.silhouette_iou > 0.999
+    same = compare(first, second, views=2, resolution=48, samples=4)
+    assert same.metrics.psnr_covered > 50
+    assert same.metrics.silhouette_iou > 0.999
+    assert not any("apart" in note for note in same.notes)
+    moved = compare(first, apart(first, PLACE), views=1, resolution=16, samples=1).notes
+    assert not any("apart" in note for note in moved)
+    elsewhere = replace(first, origin=tuple((PLACE - (30, 0, 0)).tolist()))
+    assert any("30 m apart" in note for note in compare(first, elsewhere, views=2, resolution=64).notes)
+    with pytest.raises(InputError, match=r"m apart, .* move one of them"):
+        compare(first, replace(first, origin=(0, 0, 0)), views=1, resolution=16)
 
 
 def test_aligned_to_another_origin() -> None:

@@ -86,12 +86,29 @@ def _compared(
 
     frame, sampler = framed(np.concatenate([first.points(), second.points()]), seed)
     sampler = sampler.held_out(MEASURED)
-    result = compare_in_frame(in_frame(first, *frame), in_frame(second, *frame), sampler, views, resolution, samples)
+    apart = _apart(first, second)
+    in_one = in_frame(first, *frame), in_frame(second, *frame)
+    try:
+        result = compare_in_frame(*in_one, sampler, views, resolution, samples)
+    except InputError as error:  # of two small things far from each other, pictures may show neither
+        raise InputError("; ".join([str(error), *apart])) from error
     if outputs.report is not None:
         from appearance_opt.jobs.report import write_compare_report
 
         write_compare_report(outputs.report, first, second, result)
-    return replace(result, notes=(*first.notes, *second.notes, *_drawn_otherwise(first, second)))
+    return replace(result, notes=(*first.notes, *second.notes, *apart, *_drawn_otherwise(first, second)))
+
+
+def _apart(reference: Asset, candidate: Asset) -> list[str]:
+    """A note on two assets that lie so far apart that each is small in every picture."""
+    from appearance_opt.baking.check import misfit
+
+    offset, ratio, diagonal = misfit(reference, candidate)
+    if offset <= (1 + ratio) * diagonal / 2:
+        return []
+    return [
+        f"the two lie {offset:.6g} m apart, {offset / diagonal:.3g} times the size of the reference: move one of them"
+    ]
 
 
 def _drawn_otherwise(*assets: Asset) -> list[str]:
