@@ -300,7 +300,7 @@ class _Job:
             fitted,
             len(self.start.mesh.faces),
             asset.triangle_count,
-            notes=[*self.notes, *fitted.notes()],
+            notes=[*self.notes, *self.start.notes, *fitted.notes()],
             error=error,
             tessellated={k: self.parts.with_kept(a) for k, a in tessellated.items()},
             kept_triangles=self.parts.kept_triangles,
@@ -330,8 +330,17 @@ def framed(
     return frame, ViewSampler((0.0, 0.0, 0.0), 1.0, seed, hull=hull, light=light)
 
 
+SUPPORT_POINTS = 1 << 18
+"""Points of a cloud that are looked at in every direction. Of larger clouds these are taken evenly, and the extreme
+ones along axes and diagonals, so that what sticks out is not cut off."""
+
+
 def support(positions: NDArray, count: int = 256) -> NDArray[np.float64]:
     """Extreme points of a cloud in ``count`` directions: enough to frame it from any side."""
+    if len(positions) > SUPPORT_POINTS:
+        axes = np.stack(np.meshgrid(*[[-1, 0, 1]] * 3), axis=-1).reshape(-1, 3).astype(positions.dtype)
+        far = np.unique([np.argmax(positions @ axis) for axis in axes])
+        positions = np.concatenate([positions[:: -(-len(positions) // SUPPORT_POINTS)], positions[far]])
     k = np.arange(count) + 0.5
     polar, azimuth = np.arccos(1 - 2 * k / count), np.pi * (1 + 5**0.5) * k
     directions = np.stack(

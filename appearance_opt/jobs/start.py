@@ -9,8 +9,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from appearance_opt.asset.sides import culled
 from appearance_opt.errors import InputError
 from appearance_opt.initial.atlas import charted, packed, unwrap
+from appearance_opt.initial.clustering import clustered
 from appearance_opt.initial.decimate import decimate_with_source
 from appearance_opt.initial.density import chart_scales
 from appearance_opt.initial.reallocate import StartError, weights
@@ -22,6 +24,7 @@ from appearance_opt.jobs.displaced import REACH, displaced, flat_map, gutter, me
 from appearance_opt.jobs.parts import split
 from appearance_opt.latent.displacement import DISPLACEMENT
 from appearance_opt.latent.latent import LatentMesh
+from appearance_opt.render import upload
 from appearance_opt.views import START, VISIBILITY
 
 if TYPE_CHECKING:
@@ -50,6 +53,14 @@ WORTHWHILE = 0.98
 less lies within chance: starts of spot and chess_king at 1.5 % with an error 1.6 % smaller were 0.25 and 0.54 dB worse
 in the eyes of another renderer; one of chess_king at 5 % with an error 2.3 % smaller was 0.54 dB better."""
 
+SECONDS_PER_FACE, COARSE_SHARE = 2e-5, 0.25
+"""What decimation takes per face of the reference (1.4e-5 on a machine of today, more on others), and the part of a
+time budget from which it begins with a coarse round (see ``clustering``). The same on every machine, so that the same
+options make the same start."""
+
+CLUSTERS, LEAST_CLUSTERS = 40, 100_000
+"""Vertices that a coarse round leaves, per triangle that is asked for, and at the least."""
+
 TIGHT_TRIANGLES = 10_000
 """Largest mesh whose atlas is packed by trying every place: the time grows with the square of the charts."""
 
@@ -59,7 +70,8 @@ class Start:
     """``maps``: channel name -> image or number; ``relative``: may the Laplacian keep this shape?
     ``known``: texels whose values mean something. ``levels``: tessellation levels at which it is drawn;
     ``finest``: the displaced mesh of the finest one, None without displacement. ``grown``: was it found by fitting
-    (from a sphere)? ``charts``: the mesh with its charts as they were before they were packed, if they were kept."""
+    (from a sphere)? ``charts``: the mesh with its charts as they were before they were packed, if they were kept.
+    ``notes``: what the user should know of how it was made."""
 
     mesh: LatentMesh
     maps: dict[str, NDArray | float]
@@ -69,6 +81,7 @@ class Start:
     finest: LatentMesh | None = None
     grown: bool = False
     charts: LatentMesh | None = None
+    notes: tuple[str, ...] = ()
 
     @property
     def drawn(self) -> LatentMesh:
@@ -111,6 +124,10 @@ def make_start(
     began = time.perf_counter()
     start = starts.weighted(starts.weight)
     taken = time.perf_counter() - began
+    if starts.coarse:
+        left_out = "decimation began with a coarse round, and triangles were not moved to where they are missed"
+        many = f"{len(reference.merged.faces):,} triangles are many for --budget {options.budget:g}"
+        return replace(start, notes=(f"{many}: {left_out}",))
     rounds = affordable(options.reallocate, taken, None if seconds is None else seconds - taken)
     if not rounds:
         return start
@@ -129,29 +146,46 @@ def affordable(rounds: int, taken: float, left: float | None) -> int:
     return min(rounds, max(int(REALLOCATION_SHARE * left / taken - REALLOCATION_EXTRA), 0))
 
 
+def is_coarse(faces: int, vertices: int, clusters: int, budget: float | None) -> bool:
+    """Does decimation of a mesh begin with a coarse round? If it would take much of the time budget (seconds), and if
+    that leaves half of the vertices at the most."""
+    return budget is not None and SECONDS_PER_FACE * faces > COARSE_SHARE * budget and 2 * clusters < vertices
+
+
 class _Decimated:
-    """Starts from the reference with fewer triangles. ``weight``: importance of its faces by how much is seen of them;
-    ``visible``: those that are decimated at all; ``views``: views that neither the fit nor its validation uses."""
+    """Starts from the reference with fewer triangles. ``coarse``: is it clustered first, as it is too large for the
+    time budget? ``positions``, ``faces``, ``single``: what is decimated, the reference's or the clusters'; ``weight``:
+    importance of these faces by how much is seen of them; ``visible``: those that are decimated at all; ``views``:
+    views that neither the fit nor its validation uses."""
+
+    positions: NDArray
+    faces: NDArray
 
     def __init__(
         self, reference: MeshReference, options: SimplifyOptions, sampler: ViewSampler, triangles: int
     ) -> None:
         self.reference, self.options, self.triangles = reference, options, triangles
         self.views = sampler.held_out(START)
-        merged = reference.merged
-        count = len(merged.faces)
+        merged, scene = reference.merged, reference.scene
+        self.positions, self.faces, self.single = merged.positions, merged.faces, reference.single
+        clusters = max(CLUSTERS * triangles, LEAST_CLUSTERS)
+        self.coarse = is_coarse(len(merged.faces), len(merged.positions), clusters, options.budget)
+        if self.coarse:
+            self.positions, self.faces, source = clustered(merged.positions, merged.faces, clusters)
+            self.single = reference.single[source]
+            scene = upload.scene_of(self.positions, self.faces, culled(self.positions, self.faces, self.single))
+        count = len(self.faces)
         self.weight, self.visible = np.ones(count), np.ones(count, bool)
         if not options.keep_hidden:
-            pixels = pixel_counts(reference.scene, count, sampler.held_out(VISIBILITY), VISIBILITY_VIEWS)
-            self.weight, seen = importance(merged.positions, merged.faces, pixels)
+            pixels = pixel_counts(scene, count, sampler.held_out(VISIBILITY), VISIBILITY_VIEWS)
+            self.weight, seen = importance(self.positions, self.faces, pixels)
             self.visible = seen if seen.sum() >= triangles else self.visible
 
     def weighted(self, weight: NDArray) -> Start:
         """The reference decimated with these importances of its faces (F,)."""
-        merged, visible = self.reference.merged, self.visible
-        single = self.reference.single[visible]
+        single = self.single[self.visible]
         positions, faces, source = decimate_with_source(
-            merged.positions, merged.faces[visible], self.triangles, weight[visible], single
+            self.positions, self.faces[self.visible], self.triangles, weight[self.visible], single
         )
         if not len(faces):
             raise InputError("nothing is left of this mesh at that budget; ask for more triangles")
