@@ -12,11 +12,16 @@ def _escape(character: str) -> str:
     return character.encode("unicode_escape").decode("ascii")
 
 
+LONGEST = 1000
+"""Characters of a message at most: data that is quoted may have any length."""
+
+
 class AppearanceError(Exception):
     """Base of every error that this package raises on purpose. Its message is one line of printable text."""
 
     def __init__(self, message: str = "") -> None:
-        super().__init__(one_line(message))
+        line = one_line(message)
+        super().__init__(line if len(line) <= LONGEST else f"{line[: LONGEST - 203]} ... {line[-198:]}")
 
 
 class InputError(AppearanceError):

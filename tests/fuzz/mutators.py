@@ -29,7 +29,7 @@ VALUES: tuple[Any, ...] = (
 
 INTEGERS = (0, 1, 0x7F, 0xFF, 0xFFFF, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFF)
 
-TEXTS = ("glTF", "USDA", "MaterialX", "OBJ", "MTL", "PLY, text", "STL, text", "TOML")
+TEXTS = ("glTF", "USDA", "MaterialX", "OBJ", "MTL", "PLY text", "STL text", "TOML")
 
 
 def mutate(kind: str, data: bytes, rng: random.Random) -> bytes:

@@ -10,7 +10,10 @@ from pathlib import Path
 import numpy as np
 
 from appearance_opt.asset import save
+from appearance_opt.fit import archive
 from tests.conftest import make_asset
+
+FINGERPRINT = "the job of the seeds"
 
 
 @dataclass(frozen=True)
@@ -34,13 +37,14 @@ SEEDS = {
     "OBJ": Seed("x.obj", "x.obj"),
     "MTL": Seed("x.mtl", "x.obj"),
     "PLY": Seed("x.ply", "x.ply"),
-    "PLY, text": Seed("text.ply", "text.ply"),
+    "PLY text": Seed("text.ply", "text.ply"),
     "STL": Seed("x.stl", "x.stl"),
-    "STL, text": Seed("text.stl", "text.stl"),
+    "STL text": Seed("text.stl", "text.stl"),
     "PNG": Seed("x.png", "x.png", "picture"),
     "JPEG": Seed("x.jpg", "x.jpg", "picture"),
     "EXR": Seed("x.exr", "x.exr", "picture"),
     "TOML": Seed("x.toml", "x.toml", "job"),
+    "checkpoint": Seed("x.npz", "x.npz", "checkpoint"),
 }
 
 JOB = """preset = "draft"
@@ -119,6 +123,8 @@ def write_seeds(folder: Path) -> None:
         out = oiio.ImageOutput.create(f"x.{suffix}")
         assert out.open(str(folder / f"x.{suffix}"), oiio.ImageSpec(17, 24, 3, kind)) and out.write_image(pixels)
         out.close()
+    rows = {k: np.arange(40, dtype=np.float32) for k in ("positions", "texels")}
+    archive.write(folder / "x.npz", FINGERPRINT, {"values": rows, "curve": [(0.5, 1)], "seconds": 1.5})
 
 
 def glb_parts(data: bytes) -> tuple[dict, bytes]:

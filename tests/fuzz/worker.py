@@ -18,8 +18,9 @@ from pathlib import Path
 from appearance_opt.asset import images, load
 from appearance_opt.config import read_toml, simplify_options
 from appearance_opt.errors import InputError
+from appearance_opt.fit import archive
 from tests.fuzz.mutators import mutate
-from tests.fuzz.seeds import SEEDS
+from tests.fuzz.seeds import FINGERPRINT, SEEDS
 
 LONGEST = 2000
 """Characters of an error at most."""
@@ -40,7 +41,15 @@ def read_job(path: Path) -> None:
     simplify_options(**read_toml(path))
 
 
-READERS = {"asset": read_asset, "picture": read_picture, "job": read_job}
+def read_checkpoint(path: Path) -> None:
+    """The values of a checkpoint; whoever reads one names the file."""
+    try:
+        archive.read(path, FINGERPRINT, ())
+    except archive.DamagedError as error:
+        raise InputError(f"{path}: {error}") from error
+
+
+READERS = {"asset": read_asset, "picture": read_picture, "job": read_job, "checkpoint": read_checkpoint}
 
 
 def outcome(reader: str, path: Path) -> str:
