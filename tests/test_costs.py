@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from appearance_opt.asset import batch, load, usd_read, uv_frames, validate
+from appearance_opt.asset import batch, load, save, usd_read, usd_write, uv_frames, validate
 from appearance_opt.asset.gltf_accessors import Document
 from appearance_opt.asset.gltf_read import _Reader
 from appearance_opt.asset.notes import LINES, Notes
@@ -290,3 +290,28 @@ def test_materials_of_one_texel_are_uploaded_together(monkeypatch: pytest.Monkey
     texels = np.array(pyramid.texels).reshape(-1, 8)
     for base, offsets in zip(bases, pyramid.layout.offsets, strict=True):
         np.testing.assert_array_equal(texels[offsets[0] : offsets[0] + base[..., 0].size], base.reshape(-1, 8))
+
+
+def test_many_meshes_are_written_in_groups(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(usd_write, "SIBLINGS", 3)
+    positions, faces = (np.array(a) for a in ball(0))
+    meshes = [Mesh(positions + np.float32(k), faces, positions, name=f"m{k}") for k in range(8)]
+    save(Asset(tuple(meshes)), tmp_path / "x.usda")
+    again = load(tmp_path / "x.usda").meshes
+    assert [m.name for m in again] == [f"G{k}_m{k}" for k in range(8)]
+    np.testing.assert_allclose([m.positions for m in again], [m.positions for m in meshes], atol=1e-6)
+    assert (tmp_path / "x.usda").read_text().count('def Scope "Group') == 3
+
+
+def test_warnings_of_usd_that_differ_in_names_are_counted(tmp_path: Path) -> None:
+    parts = "".join(f'def "p{k}" (\n references = @gone{k}.usda@\n)\n{{\n}}\n' for k in range(30))
+    mesh = """def Mesh "m"
+{
+    int[] faceVertexCounts = [3]
+    int[] faceVertexIndices = [0, 1, 2]
+    point3f[] points = [(0, 0, 0), (1, 0, 0), (0, 1, 0)]
+}
+"""
+    (tmp_path / "x.usda").write_text("#usda 1.0\n" + mesh + parts)
+    told = [note for note in load(tmp_path / "x.usda").notes if "gone" in note or "more" in note]
+    assert len(told) == LINES + 1 and told[-1].startswith("... and 22 more: ")

@@ -173,7 +173,7 @@ class Asset:
 
     def bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Corners (3,), (3,) of the axis-aligned box around all referenced vertices, in the world."""
-        used = [m.positions[np.unique(m.faces)] for m in self.meshes if len(m.faces)]
+        used = [m.positions[_marked(m.faces, len(m.positions))] for m in self.meshes if len(m.faces)]
         low = np.min([p.min(axis=0) for p in used], axis=0).astype(np.float64)
         high = np.max([p.max(axis=0) for p in used], axis=0).astype(np.float64)
         return low + self.origin, high + self.origin
@@ -181,6 +181,13 @@ class Asset:
     def points(self) -> NDArray[np.float64]:
         """(N, 3) all vertices, in the world."""
         return np.concatenate([m.positions for m in self.meshes]).astype(np.float64) + self.origin
+
+
+def _marked(indices: NDArray, count: int) -> NDArray[np.bool_]:
+    """(count,) which numbers are among the indices?"""
+    out = np.zeros(count, bool)
+    out[indices] = True
+    return out
 
 
 def srgb_to_linear(x: NDArray) -> NDArray:

@@ -15,6 +15,7 @@ from appearance_opt.asset.alpha import OPAQUE
 from appearance_opt.asset.batch import smoothed
 from appearance_opt.asset.companions import Companions
 from appearance_opt.asset.normals import accumulate, unit
+from appearance_opt.asset.notes import Notes
 from appearance_opt.asset.origin import settle
 from appearance_opt.asset.paths import check_inside, common_folder, read_bytes
 from appearance_opt.asset.placement import Placement, placed
@@ -45,6 +46,10 @@ _UVS = "uvs:"
 """Before the name of a primvar of texture coordinates, among the attributes of a mesh."""
 
 
+MOST = 160
+"""Characters of what USD says that are handed on."""
+
+
 def load_usd(
     path: Path,
     refine: int = 1,
@@ -69,7 +74,10 @@ def load_usd(
         raise InputError(f"{path}: not a readable USD file ({(said or [_text(error.__str__)])[0]})") from None
     finally:
         warned = [_text(partial(getattr, w, "commentary")) for w in diagnostics.TakeUncoalescedDiagnostics()]
-    return replace(asset, notes=asset.notes + tuple(f"USD: {text}" for text in dict.fromkeys(warned)))
+    told = Notes()
+    for text in warned:  # of one kind are those that differ in paths and names of files only
+        told(f"USD: {text[:MOST]}", re.sub(r"<[^>]*>|@[^@]*@|'[^']*'", "...", text)[:MOST])
+    return replace(asset, notes=asset.notes + told.lines())
 
 
 def _read_stage(path: Path, refine: int, variants: dict[str, str], companions: Companions, keep_layout: bool) -> Asset:

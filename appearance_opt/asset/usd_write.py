@@ -24,6 +24,10 @@ _SPACES: dict[str, ColorSpace] = {"sRGB": "srgb", "raw": "linear"}
 """Our names of UsdUVTexture's colour spaces."""
 
 
+SIBLINGS = 500
+"""Meshes that lie below one prim."""
+
+
 def save_usd(asset: Asset, path: Path) -> None:
     """Write .usd, .usda or .usdc with PNG files in ``<stem>_textures/``, or one .usdz package. Y up,
     metres. Vertex colours, times the base colour, are read by the surface where it has no texture of that; a
@@ -67,8 +71,21 @@ def _write_stage(asset: Asset, root: Path, textures: str) -> None:
             word = Tf.MakeValidIdentifier(mesh.material.name)[:MAX_NAME]
             target = f"/{name}/Materials/M{len(materials)}_{word}"
             materials[key] = _material(stage, target, mesh.material, root.parent / textures, key[1], key[2])
-        _mesh(stage, f"/{name}/G{k}_{Tf.MakeValidIdentifier(mesh.name)}", mesh, materials[key])
+        parent = _parent(stage, name, k, len(asset.meshes))
+        _mesh(stage, f"{parent}/G{k}_{Tf.MakeValidIdentifier(mesh.name)}", mesh, materials[key])
     stage.GetRootLayer().Save()
+
+
+def _parent(stage: Any, name: str, number: int, count: int) -> str:
+    """The prim below which a mesh goes: the top, or a group, for what has many siblings takes long to add."""
+    from pxr import UsdGeom
+
+    if count <= SIBLINGS:
+        return f"/{name}"
+    group = f"/{name}/Group{number // SIBLINGS}"
+    if number % SIBLINGS == 0:
+        UsdGeom.Scope.Define(stage, group)
+    return group
 
 
 def _colored(mesh: Mesh) -> bool:
