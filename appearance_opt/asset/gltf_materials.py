@@ -17,15 +17,17 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from appearance_opt.asset.gltf_accessors import Document
+    from appearance_opt.asset.types import AlphaMode
     from appearance_opt.asset.udim import Tile
 
 STRENGTH = "KHR_materials_emissive_strength"
 SPECULAR = "KHR_materials_pbrSpecularGlossiness"
 VARIANTS = "KHR_materials_variants"
+UNLIT = "KHR_materials_unlit"
 TRANSMISSION, VOLUME, IOR = (f"KHR_materials_{name}" for name in ("transmission", "volume", "ior"))
 _TRANSPARENT = (TRANSMISSION, VOLUME, IOR)
 _IMAGES = ("EXT_texture_webp", "KHR_texture_basisu")
-READ_EXTENSIONS = (STRENGTH, SPECULAR, *_TRANSPARENT, VARIANTS, "KHR_texture_transform", *_IMAGES)
+READ_EXTENSIONS = (STRENGTH, SPECULAR, *_TRANSPARENT, VARIANTS, UNLIT, "KHR_texture_transform", *_IMAGES)
 """Extensions of materials and textures that are heeded."""
 
 _WRAPS: dict[int, Wrap] = {10497: "repeat", 33071: "clamp", 33648: "mirror"}
@@ -121,12 +123,14 @@ class MaterialReader:
     def _read_material(self, index: int) -> Material:
         m = self.document.items("materials")[index]
         name = m.get("name", f"material{index}")
+        if UNLIT in m.get("extensions", {}):
+            return self._unlit(m, name)
         specular = m.get("extensions", {}).get(SPECULAR)
         if specular is None:
             material = self._metallic(m.get("pbrMetallicRoughness", {}), name)
         else:
             material = self._converted(specular, name)
-        mode = {"MASK": "mask", "BLEND": "blend"}.get(m.get("alphaMode", "OPAQUE"), "opaque")
+        mode = _alpha_mode(m)
         material = self._transmissive(material, m.get("extensions", {}), name)
         if "occlusionTexture" in m:
             material = self._occluded(material, m, name, mode != "opaque" or material.transmission > 0)
@@ -136,11 +140,23 @@ class MaterialReader:
             material,
             normal_scale=float(normal.get("scale", 1.0)) if normal else 1.0,
             normal_texture=self._texture(normal, "linear", name),
-            alpha_mode=mode,  # type: ignore[arg-type]
+            alpha_mode=mode,
             alpha_cutoff=float(m.get("alphaCutoff", 0.5)),
             double_sided=bool(m.get("doubleSided", False)),
             emission=emission,
             emission_texture=emission_texture,
+        )
+
+    def _unlit(self, m: dict[str, Any], name: str) -> Material:
+        """A material of which nothing but its base colour and alpha counts (KHR_materials_unlit)."""
+        pbr = {k: v for k, v in m.get("pbrMetallicRoughness", {}).items() if k.startswith("baseColor")}
+        return replace(
+            self._metallic(pbr, name),
+            metalness=0.0,
+            alpha_mode=_alpha_mode(m),
+            alpha_cutoff=float(m.get("alphaCutoff", 0.5)),
+            double_sided=bool(m.get("doubleSided", False)),
+            unlit=True,
         )
 
     def _metallic(self, pbr: dict[str, Any], name: str) -> Material:
@@ -268,6 +284,11 @@ class MaterialReader:
 
 def _refuse(reason: str) -> NDArray:
     raise InputError(reason)
+
+
+def _alpha_mode(m: dict[str, Any]) -> AlphaMode:
+    modes: dict[str, AlphaMode] = {"MASK": "mask", "BLEND": "blend"}
+    return modes.get(m.get("alphaMode", "OPAQUE"), "opaque")
 
 
 def _source(texture: dict[str, Any]) -> int | None:

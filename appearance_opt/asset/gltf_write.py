@@ -13,7 +13,7 @@ import numpy as np
 
 from appearance_opt.asset import images
 from appearance_opt.asset.encoding import encoded_for
-from appearance_opt.asset.gltf_materials import IOR, STRENGTH, TRANSMISSION, VOLUME
+from appearance_opt.asset.gltf_materials import IOR, STRENGTH, TRANSMISSION, UNLIT, VOLUME
 from appearance_opt.asset.height import as_16_bit, height_png
 from appearance_opt.asset.sides import apart_from_sides
 
@@ -149,14 +149,18 @@ class _Writer:
         }
         if m.base_color_texture is not None:
             pbr["baseColorTexture"] = {"index": self._texture(m.base_color_texture, "srgb")}
-        if m.orm_texture is not None:
+        if m.unlit:  # what readers without the extension show comes near (KHR_materials_unlit, "Fallback")
+            pbr |= {"roughnessFactor": 0.9, "metallicFactor": 0.0}
+        elif m.orm_texture is not None:
             pbr["metallicRoughnessTexture"] = {"index": self._texture(m.orm_texture)}
         out: dict[str, Any] = {"name": m.name, "pbrMetallicRoughness": pbr, "doubleSided": m.double_sided}
-        if m.normal_texture is not None:
+        if m.unlit:
+            self._extend(out, UNLIT, {})
+        elif m.normal_texture is not None:
             out["normalTexture"] = {"index": self._texture(m.normal_texture), "scale": m.normal_scale}
-        if m.orm_texture is not None and m.has_occlusion:
+        if m.orm_texture is not None and m.has_occlusion and not m.unlit:
             out["occlusionTexture"] = {"index": self._texture(m.orm_texture)}
-        if m.emits:
+        if m.emits and not m.unlit:
             self._add_emission(out, m)
         if m.transmission > 0:
             self._add_transmission(out, m)

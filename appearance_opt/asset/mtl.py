@@ -51,6 +51,10 @@ WITHOUT_MAP, LOST = "# without its map: ", "lost:"
 """Start of the comments in which our own files keep a constant for when its map gets lost, and what stands for it here
 before the constant's key. The maps hold the factors there, and the constants beside them are 1 (see ``obj_write``)."""
 
+UNLIT_MARK, UNLIT = "# unlit", "unlit"
+"""Comment by which our own files say that a material is shown without light, and its key here. Others that write
+"illum 0", which means that, too, seldom mean it."""
+
 ALPHA_TEST, TESTED = "# alpha test: ", "tested"
 """Start of the comment in which our own files keep the cutoff of a material with the alpha mode "mask", for which the
 format has no word, and its key here."""
@@ -93,6 +97,8 @@ class MaterialReader:
         for line in read_text(path).splitlines():
             if line.startswith(WITHOUT_MAP):
                 line = LOST + line[len(WITHOUT_MAP) :]
+            elif line == UNLIT_MARK:
+                line = f"{UNLIT} 1"
             elif line.startswith(ALPHA_TEST):
                 line = f"{TESTED} {line[len(ALPHA_TEST) :]}"
             words = line.split(None, 1)
@@ -147,6 +153,7 @@ class _Statements:
         # without the map that says where it glows, nothing does
         lost = glow_map is None and "map_ke" in self.values
         glow = [0.0] * 3 if lost else self._numbers("ke", [float(glow_map is not None)] * 3)
+        unlit = UNLIT in self.values
         normal, strength = self._normal()
         opacity, alpha_map = self._opacity()
         self._note_what_is_dropped()
@@ -164,6 +171,7 @@ class _Statements:
             alpha_cutoff=self._numbers(TESTED, [0.5])[0],
             emission=(glow[0], glow[1], glow[2]),
             emission_texture=glow_map,
+            unlit=unlit,
         )
 
     def _numbers(self, key: str, default: list[float]) -> list[float]:

@@ -10,7 +10,7 @@ import numpy as np
 from appearance_opt.asset import images
 from appearance_opt.asset.alpha import coverage, kind_of
 from appearance_opt.asset.encoding import encoded_for
-from appearance_opt.asset.mtl import ALPHA_TEST, WITHOUT_MAP
+from appearance_opt.asset.mtl import ALPHA_TEST, UNLIT_MARK, WITHOUT_MAP
 from appearance_opt.asset.paths import file_name
 from appearance_opt.asset.sides import apart_from_sides
 from appearance_opt.asset.types import Texture, linear_to_srgb
@@ -97,7 +97,7 @@ def _mtl_lines(m: Material, path: Path) -> list[str]:
             return [f"{key} {text}"]
         return [f"{key} {' '.join('1' for _ in values)}", f"{WITHOUT_MAP}{key} {text}"]
 
-    orm = m.orm_texture is not None
+    orm = m.orm_texture is not None and not m.unlit
     lines = [f"newmtl {m.name}", *constant("Kd", m.base_color, m.base_color_texture is not None)]
     lines += [*constant("Pr", (m.roughness,), orm), *constant("Pm", (m.metalness,), orm)]
     if m.base_color_texture is not None:
@@ -106,11 +106,13 @@ def _mtl_lines(m: Material, path: Path) -> list[str]:
     if orm:
         lines.append("map_Pr " + picture("roughness", plane(1, m.roughness)))
         lines.append("map_Pm " + picture("metalness", plane(2, m.metalness)))
-    if m.emits:
+    if m.unlit:  # "0: Color on and Ambient off" (MTL specification, illum), a constant colour
+        lines += ["illum 0", UNLIT_MARK]
+    elif m.emits:
         lines.append("Ke " + " ".join(f"{x:.6g}" for x in m.emission))
         if m.emission_texture is not None:
             lines.append("map_Ke " + picture("emission", encoded_for(m.emission_texture, "srgb")))
-    if m.normal_texture is not None:
+    if m.normal_texture is not None and not m.unlit:
         strength = "" if m.normal_scale == 1 else f"-bm {m.normal_scale:.6g} "
         lines.append(f"norm {strength}" + picture("normal", encoded_for(m.normal_texture, "linear")[..., :3]))
     factor, alpha = coverage(m)

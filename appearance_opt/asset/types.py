@@ -94,6 +94,8 @@ class Material:
     with the ``alpha_mode`` "opaque"; with "mask" the surface is there where alpha is at least ``alpha_cutoff``; with
     "blend" alpha is its coverage. ``transmission``: share of the light that passes through (times the red channel of
     its texture); ``ior``, ``volume`` and the green channel of ``thickness_texture`` are carried over beside it.
+
+    ``unlit``: shown in its base colour whatever the light, as if it were a picture of itself (KHR_materials_unlit).
     """
 
     name: str = "material"
@@ -117,6 +119,7 @@ class Material:
     ior: float = 1.5
     volume: Volume | None = None
     thickness_texture: Texture | None = None
+    unlit: bool = False
 
     @property
     def emits(self) -> bool:

@@ -33,6 +33,7 @@ _PURPOSES = ("full", "preview", "")
 """Purposes of bindings in the order in which they are taken; the last is that for all."""
 MAX_TRANSFORMS = 16
 """Transforms in a row before a texture's coordinates: networks may have cycles."""
+_REFLECTANCES = ("diffuseColor", "specularColor")
 _CHANNEL = {"r": 0, "g": 1, "b": 2, "a": 3}
 
 
@@ -236,14 +237,18 @@ class MaterialReader:
 
     def _preview(self, shader: Any, name: str) -> Material:
         of = partial(_input, shader)
-        color, color_map, _ = of("diffuseColor", (0.18, 0.18, 0.18))
+        unlit = _reflects_nothing(shader)
+        color, color_map, _ = of("emissiveColor", (1.0, 1.0, 1.0)) if unlit else of("diffuseColor", (0.18, 0.18, 0.18))
         roughness, rough_map, rough_channel = of("roughness", 0.5)
         metalness, metal_map, metal_channel = of("metallic", 0.0)
         _, normal_map, _ = of("normal", None)
         glow, glow_map, _ = of("emissiveColor", (0.0, 0.0, 0.0))
+        if unlit:
+            roughness, rough_map, metalness, metal_map, normal_map = 1.0, None, 0.0, None, None
+            glow, glow_map = (0.0, 0.0, 0.0), None
         base, base_factor = self._scaled(color_map, "srgb", "rgb", _rgb(color))
         rough, rough_factor = self._scaled(rough_map, "linear", rough_channel, (float(roughness),) * 3)
-        if int(of("useSpecularWorkflow", 0)[0]) == 1:
+        if not unlit and int(of("useSpecularWorkflow", 0)[0]) == 1:
             tint, metal_map, _ = of("specularColor", (0.0, 0.0, 0.0))
             shine, shine_factor = self._scaled(metal_map, "srgb", "rgb", _rgb(tint))
             self.note(f"material '{name}': its specular workflow converted to metallic-roughness")
@@ -279,6 +284,7 @@ class MaterialReader:
             alpha_cutoff=threshold if threshold > 0 else 0.5,
             emission=strength,
             emission_texture=emission,
+            unlit=unlit,
         )
         nodes = {
             "base_color_texture": color_map,
@@ -441,6 +447,16 @@ def _key(material: Any) -> str:
     """The path of a material, the same for the copies of an instance."""
     prim = material.GetPrim()
     return str((prim.GetPrimInPrototype() if prim.IsInstanceProxy() else prim).GetPath())
+
+
+def _reflects_nothing(shader: Any) -> bool:
+    """Does a UsdPreviewSurface emit light and reflect none? That is how one is shown in its colour whatever the light,
+    for which USD has no other word."""
+    values = [_input(shader, key, (0.18,) * 3 if key == "diffuseColor" else (0.0,) * 3) for key in _REFLECTANCES]
+    dark = all(node is None and not any(color) for color, node, _ in values)
+    glow = shader.GetInput("emissiveColor")
+    shown = bool(glow) and (glow.HasConnectedSource() or any(_value(glow) or ()))
+    return dark and shown and _value(shader.GetInput("useSpecularWorkflow")) == 1
 
 
 def _input(shader: Any, key: str, default: Any) -> tuple[Any, Any, str]:

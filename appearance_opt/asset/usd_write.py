@@ -139,15 +139,20 @@ def _material(stage: Any, target: str, m: Material, folder: Path, colored: bool,
     material = UsdShade.Material.Define(stage, target)
     preview = _Preview(stage, target, folder)
     material.CreateSurfaceOutput().ConnectToSource(preview.shader.ConnectableAPI(), "surface")
-    if colored:
-        preview.primvar("diffuseColor", "Color3f", "UsdPrimvarReader_float3", "displayColor")
+    shown = "diffuseColor"
+    if m.unlit:
+        preview.reflect_nothing()
+        shown = "emissiveColor"
     else:
-        preview.color("diffuseColor", "base_color", m.base_color, m.base_color_texture)
-    if m.emits:
-        preview.color("emissiveColor", "emission", m.emission, m.emission_texture)
-    preview.roughness_and_metalness(m)
+        if m.emits:
+            preview.color("emissiveColor", "emission", m.emission, m.emission_texture)
+        preview.roughness_and_metalness(m)
+    if colored:
+        preview.primvar(shown, "Color3f", "UsdPrimvarReader_float3", "displayColor")
+    else:
+        preview.color(shown, "base_color", m.base_color, m.base_color_texture)
     preview.opacity(m, veiled)
-    if m.normal_texture is not None:
+    if m.normal_texture is not None and not m.unlit:
         s = m.normal_scale
         node = preview.sampler("normal", m.normal_texture, "raw", (2 * s, 2 * s, 2, 1), (-s, -s, -1, 0))
         preview.connect("normal", "Normal3f", node, "rgb")
@@ -225,6 +230,15 @@ class _Preview:
         reader = self._node(primvar, node)
         reader.CreateInput("varname", self.types.String).Set(primvar)
         self.connect(name, kind, reader, "result")
+
+    def reflect_nothing(self) -> None:
+        """Black in any light, but for a little at grazing angles: a UsdPreviewSurface reflects all light there."""
+        from pxr import Gf
+
+        self.shader.CreateInput("useSpecularWorkflow", self.types.Int).Set(1)
+        for name in ("diffuseColor", "specularColor"):
+            self.shader.CreateInput(name, self.types.Color3f).Set(Gf.Vec3f(0))
+        self.shader.CreateInput("roughness", self.types.Float).Set(1.0)
 
     def roughness_and_metalness(self, m: Material) -> None:
         """Both, and occlusion, from one texture, or constants."""

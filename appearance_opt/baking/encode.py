@@ -58,12 +58,16 @@ def curvature_scale(maps: Mapping[str, NDArray], covered: NDArray) -> float:
     return max(float(np.quantile(values, CURVATURE_QUANTILE)) if len(values) else 0.0, 1e-12)
 
 
-def material_change(maps: Mapping[str, NDArray], options: BakeOptions) -> Callable[[Material], Material]:
-    """A function from LOW's materials to those of the result: what was baked replaces what was there."""
+def material_change(
+    maps: Mapping[str, NDArray], options: BakeOptions, unlit: bool = False
+) -> Callable[[Material], Material]:
+    """A function from LOW's materials to those of the result: what was baked replaces what was there. ``unlit``: is
+    HIGH?"""
     new: dict[str, Any] = {}
     if options.wants("base-color"):
         color = linear_to_srgb(np.clip(stacked(maps, "red", "green", "blue"), 0, 1))
-        new |= {"base_color": (1.0, 1.0, 1.0), "base_color_texture": Texture(quantised(color, 8), "srgb", CLAMP)}
+        texture = Texture(quantised(color, 8), "srgb", CLAMP)
+        new |= {"base_color": (1.0, 1.0, 1.0), "base_color_texture": texture, "unlit": unlit}
     if options.wants("orm"):
         orm = Texture(quantised(orm_image(maps), 8), "linear", CLAMP)
         new |= {"roughness": 1.0, "metalness": 1.0, "orm_texture": orm, "has_occlusion": "occlusion" in maps}
@@ -73,8 +77,8 @@ def material_change(maps: Mapping[str, NDArray], options: BakeOptions) -> Callab
             "normal_texture": Texture(quantised(normal_image(maps), options.bits), "linear", CLAMP),
         }
     if EMISSION[0] in maps:
-        emission, texture = pack_emission(stacked(maps, *EMISSION))
-        new |= {"emission": emission, "emission_texture": texture}
+        emission, glow = pack_emission(stacked(maps, *EMISSION))
+        new |= {"emission": emission, "emission_texture": glow}
     if options.wants("displacement"):
         new["displacement"] = displacement_of(maps["displacement"])
 

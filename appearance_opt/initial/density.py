@@ -15,7 +15,7 @@ import numpy as np
 
 from appearance_opt.initial.atlas import charts_of, uv_areas
 from appearance_opt.latent.latent import LatentTopology
-from appearance_opt.latent.texels import TexelCodec
+from appearance_opt.latent.texels import maps_of
 from appearance_opt.render import rays
 from appearance_opt.render.deferred import Grid, render_image
 from appearance_opt.render.display import display
@@ -40,9 +40,9 @@ UNSEEN = 1e-3
 """Loss per texel that every chart has, relative to the mean: views are few, and miss some."""
 
 
-def chart_scales(mesh: LatentMesh, maps: Mapping[str, NDArray], sampler: ViewSampler) -> NDArray[np.float64]:
+def chart_scales(mesh: LatentMesh, maps: Mapping[str, NDArray | float], sampler: ViewSampler) -> NDArray[np.float64]:
     """(F,) how much longer and wider each face's chart should be than it is in the atlas of ``mesh``, relative to the
-    others. ``maps``: (size, size) by channel name, in natural units; ``sampler``: views and lights."""
+    others. ``maps``: (size, size), or a number, by channel name, in natural units; ``sampler``: views and lights."""
     chart = charts_of(mesh)
     texels = np.bincount(chart, uv_areas(mesh))
     loss = np.bincount(chart, _loss_of_half(mesh, maps, sampler))
@@ -54,16 +54,13 @@ def chart_scales(mesh: LatentMesh, maps: Mapping[str, NDArray], sampler: ViewSam
     return np.clip(scale, SMALLEST, LARGEST)[chart]
 
 
-def _loss_of_half(mesh: LatentMesh, maps: Mapping[str, NDArray], sampler: ViewSampler) -> NDArray[np.float64]:
+def _loss_of_half(mesh: LatentMesh, maps: Mapping[str, NDArray | float], sampler: ViewSampler) -> NDArray[np.float64]:
     """(F,) squared display error that maps at half the resolution make, over the pixels that show each face."""
     topology = LatentTopology(mesh, tangents="normal_x" in maps)
     scene = topology.scene()
     surface = topology.surface(mi.Float(np.ascontiguousarray(mesh.positions, np.float32).ravel()))
-    names = tuple(c for c in CHANNELS if c in maps)
-    codec = TexelCodec(names, len(maps[names[0]]))
-    both = [
-        MaterialMaps((codec.layer(codec.encode(m)),)) for m in (maps, {n: halved(np.asarray(maps[n])) for n in names})
-    ]
+    half = {n: halved(np.asarray(v)) if np.ndim(v) and n in CHANNELS else v for n, v in maps.items()}
+    both = [maps_of(m) for m in (maps, half)]
     grid, out = Grid(BATCH, RESOLUTION), np.zeros(len(mesh.faces))
     pixel = np.array((grid.view * grid.rows + grid.row) * grid.rows + grid.column)
     for k in range(BATCHES):

@@ -17,11 +17,10 @@ from scipy.ndimage import maximum_filter
 
 from appearance_opt.initial.visibility import around, welded_areas
 from appearance_opt.latent.latent import LatentTopology
-from appearance_opt.latent.texels import TexelCodec
+from appearance_opt.latent.texels import maps_of
 from appearance_opt.render import rays
 from appearance_opt.render.deferred import Grid, render_image
 from appearance_opt.render.display import display
-from appearance_opt.render.material import CHANNELS, MaterialMaps
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -55,13 +54,12 @@ class StartError:
         self._records = [sampler.draw(k, BATCH).records() for k in range(views // BATCH)]
         self._images = [self._display(reference.render_device(r, self._grid, SAMPLES)) for r in self._records]
 
-    def measure(self, mesh: LatentMesh, maps: Mapping[str, NDArray]) -> tuple[float, NDArray[np.float64]]:
+    def measure(self, mesh: LatentMesh, maps: Mapping[str, NDArray | float]) -> tuple[float, NDArray[np.float64]]:
         """(mean squared display error, its sum over the pixels that show each face of the reference (F,))."""
         total = dr.zeros(mi.UInt64, len(self.reference.merged.faces))
         topology = LatentTopology(mesh, tangents=True)
         scene = topology.scene()
-        codec = TexelCodec(tuple(c for c in CHANNELS if c in maps), len(maps["red"]))
-        layers = MaterialMaps((codec.layer(codec.encode(maps)),))
+        layers = maps_of(maps)
         surface = topology.surface(mi.Float(np.ascontiguousarray(mesh.positions, np.float32).ravel()))
         mean = 0.0
         for records, expected in zip(self._records, self._images, strict=True):

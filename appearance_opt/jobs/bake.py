@@ -134,7 +134,7 @@ def split_pair(
 ) -> tuple[Parts, Parts, str]:
     """(what of HIGH is baked, what of LOW is baked onto, what to call LOW). Raises InputError if it is nothing."""
     names = [str(a) if isinstance(a, (str, Path)) else a.name for a in (high, low)]
-    return split(heavy, f"HIGH, {names[0]}", "bake"), split(light, f"LOW, {names[1]}", "bake onto"), names[1]
+    return split(heavy, f"HIGH, {names[0]}", "bake"), split(light, f"LOW, {names[1]}", "bake onto", False), names[1]
 
 
 def loaded_low(source: str | Path | Asset, options: BakeOptions) -> Asset:
@@ -215,7 +215,7 @@ class BakeJob:
         """The closed form, and the fit that starts from it."""
         from appearance_opt.baking.closed_form import bake as bake_closed_form
         from appearance_opt.jobs.fitting import fit_start
-        from appearance_opt.jobs.start import Start
+        from appearance_opt.jobs.start import Start, told
 
         baked = bake_closed_form(self.reference, self.mesh, self._settings())
         self.check_missed(baked)
@@ -234,7 +234,7 @@ class BakeJob:
         parts = self._fitted_parts()
         if not parts:
             return result, None
-        start = Start(self.mesh, {n: baked.maps[n] for n in _FITTED}, True, baked.covered)
+        start = Start(self.mesh, told(self.reference, {n: baked.maps[n] for n in _FITTED}), True, baked.covered)
         options = replace(self.options, fit=parts)
         model, fitted, error = fit_start(
             self.reference,
@@ -284,8 +284,11 @@ class BakeJob:
     def _fitted_parts(self) -> tuple[str, ...]:
         """What the fit moves: parts that are written. Colour and roughness are fitted together or not at all."""
         o = self.options
-        both = o.wants("base-color") and o.wants("orm")
-        written = {"normal": o.wants("normal"), "material": both}
+        if self.reference.unlit:
+            written = {"normal": False, "material": o.wants("base-color")}
+        else:
+            both = o.wants("base-color") and o.wants("orm")
+            written = {"normal": o.wants("normal"), "material": both}
         return () if o.closed_form else tuple(p for p in o.fit if written[p])
 
     def check_missed(self, baked: BakedMaps) -> None:
@@ -309,7 +312,8 @@ class BakeJob:
         from appearance_opt.baking.encode import material_change
         from appearance_opt.baking.low import with_material
 
-        asset = with_material(self.low.asset, material_change(self._in_metres(maps), self.options))
+        change = material_change(self._in_metres(maps), self.options, self.reference.unlit)
+        asset = with_material(self.low.asset, change)
         if self.options.wants("base-color"):  # the map holds the whole colour: vertex colours would tint it again
             asset = replace(asset, meshes=tuple(replace(m, colors=None) for m in asset.meshes))
         return self.low_parts.with_kept(replace(asset, notes=()))

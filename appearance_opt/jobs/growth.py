@@ -25,7 +25,7 @@ from appearance_opt.initial.decimate import decimate
 from appearance_opt.initial.sphere import random_maps, sphere
 from appearance_opt.interrupts import Interrupts
 from appearance_opt.jobs.fitting import VALIDATION_VIEWS, clean_maps
-from appearance_opt.jobs.start import Start, transferred
+from appearance_opt.jobs.start import Start, told, transferred
 from appearance_opt.latent.export import to_asset
 from appearance_opt.latent.latent import LatentMesh
 from appearance_opt.reference.mesh import MeshReference
@@ -86,7 +86,7 @@ def grown(
     """(start, interrupted), grown from a sphere. Only images of the reference are used."""
     texture = min(TEXTURE, options.texture_size)
     mesh = first_shape(triangles, sampler, texture)
-    maps = random_maps(texture, options.seed, options.normal_map and "normal" in options.fit)
+    maps = told(reference, random_maps(texture, options.seed, options.normal_map and "normal" in options.fit))
     model, result = _shaped(reference, sampler, options, mesh, maps, 1.0, effort)
     likeness = to_asset(mesh, model.host_positions(), clean_maps(model, np.zeros((texture, texture), bool)), "grown")
     source = MeshReference(likeness)

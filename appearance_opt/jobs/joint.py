@@ -94,7 +94,7 @@ def _fitted(job: BakeJob, options: BakeOptions, progress: Progress | None, with_
     from appearance_opt.initial.transfer import transfer_emission
     from appearance_opt.jobs.displaced import Exporter, displaced
     from appearance_opt.jobs.fitting import clean_maps, fit_start
-    from appearance_opt.jobs.start import Start
+    from appearance_opt.jobs.start import Start, told
 
     light, with_kept = job.low_parts.fitted, job.low_parts.with_kept
     mesh = movable(job.mesh)
@@ -102,7 +102,7 @@ def _fitted(job: BakeJob, options: BakeOptions, progress: Progress | None, with_
     found = bake(job.reference, drawn, Settings(options.texture_size, samples=options.samples))
     job.check_missed(found)
     maps = {n: v for n, v in found.maps.items() if options.wants("normal") or not n.startswith("normal")}
-    start = Start(mesh, {**maps, **displacement}, True, found.covered, options.levels())
+    start = Start(mesh, {**told(job.reference, maps), **displacement}, True, found.covered, options.levels())
     job.watch.lap("closed form")
     parts = tuple(dict.fromkeys(("shape", *options.fit)))
     model, fitted, error = fit_start(

@@ -35,19 +35,29 @@ class Parts:
         return replace(result, meshes=(*result.meshes, *self.kept)) if self.kept else result
 
     def told(self, becomes: str) -> list[str]:
-        """A note that names the kept meshes, or none without any. ``becomes``: what the job does with them."""
+        """Notes that name the kept meshes, or none without any. ``becomes``: what the job does with them."""
         if not self.kept:
             return []
-        names = listed(m.name for m in self.kept)
-        return [f"transparent parts {becomes}: {len(self.kept)} ({names}) of {self.kept_triangles} triangles"]
+        out = []
+        for what, seen in (("transparent", True), ("unlit", False)):
+            meshes = [m for m in self.kept if seen_through(m) == seen]
+            if meshes:
+                names, count = listed(m.name for m in meshes), sum(len(m.faces) for m in meshes)
+                out.append(f"{what} parts {becomes}: {len(meshes)} ({names}) of {count} triangles")
+        return out
 
 
-def split(asset: Asset, name: str, job: str) -> Parts:
-    """Opaque meshes are fitted, transparent ones kept. Raises InputError if nothing is left to fit. ``name`` of the
-    asset, and what the ``job`` does to it, for the message."""
+def split(asset: Asset, name: str, job: str, by_light: bool = True) -> Parts:
+    """Opaque meshes are fitted, transparent ones kept; so are unlit ones, unless all that is opaque is unlit, for one
+    result cannot be both (``by_light``). Raises InputError if nothing is left to fit. ``name`` of the asset, and what
+    the ``job`` does to it, for the message."""
     asset = settled(asset)
-    kept = tuple(m for m in asset.meshes if seen_through(m))
-    fitted = tuple(m for m in asset.meshes if not seen_through(m))
+    apart = [seen_through(m) for m in asset.meshes]
+    opaque = [m for m, out in zip(asset.meshes, apart, strict=True) if not out]
+    if by_light and not all(m.material.unlit for m in opaque):
+        apart = [out or m.material.unlit for m, out in zip(asset.meshes, apart, strict=True)]
+    kept = tuple(m for m, out in zip(asset.meshes, apart, strict=True) if out)
+    fitted = tuple(m for m, out in zip(asset.meshes, apart, strict=True) if not out)
     if not fitted:
         raise InputError(
             f"{name}: all of it is transparent ({listed(m.material.name for m in kept)}), and transparent parts are "

@@ -24,15 +24,19 @@ from appearance_opt.jobs.displaced import REACH, displaced, flat_map, gutter, me
 from appearance_opt.jobs.parts import split
 from appearance_opt.latent.displacement import DISPLACEMENT
 from appearance_opt.latent.latent import LatentMesh
+from appearance_opt.reference.mesh import MeshReference
 from appearance_opt.render import upload
+from appearance_opt.render.material import COLORS, UNLIT
 from appearance_opt.views import START, VISIBILITY
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from numpy.typing import NDArray
 
     from appearance_opt.asset.types import Asset
     from appearance_opt.config import SimplifyOptions
-    from appearance_opt.reference.mesh import MeshReference
+    from appearance_opt.reference.base import Reference
     from appearance_opt.views import ViewSampler
 
 log = logging.getLogger(__name__)
@@ -115,7 +119,7 @@ def make_start(
         if triangles < SMALLEST_SPHERE:
             raise InputError(f"--init sphere needs at least {SMALLEST_SPHERE} triangles, not {triangles}")
         mesh = sphere(triangles, sampler.centre, 0.6 * sampler.radius, size)
-        maps = random_maps(size, options.seed, options.normal_map and "normal" in options.fit)
+        maps = told(reference, random_maps(size, options.seed, options.normal_map and "normal" in options.fit))
         known = np.zeros((size, size), bool)
         if options.displaced:
             return Start(mesh, {**maps, DISPLACEMENT: flat_map(mesh, options)}, False, known, options.levels())
@@ -134,7 +138,7 @@ def make_start(
     judge = StartError(reference, starts.views)
     start, error = starts.moved(start, judge, rounds)
     again = starts.spread(start, len(start.mesh.faces) <= TIGHT_TRIANGLES)
-    return again if judge.measure(again.drawn, _images(again))[0] < error else start
+    return again if judge.measure(again.drawn, again.maps)[0] < error else start
 
 
 def affordable(rounds: int, taken: float, left: float | None) -> int:
@@ -194,11 +198,11 @@ class _Decimated:
     def moved(self, start: Start, judge: StartError, rounds: int) -> tuple[Start, float]:
         """The best of a start and those with triangles moved to where its image error is, and its error."""
         merged, weight = self.reference.merged, self.weight
-        best, (error, by_face) = start, judge.measure(start.drawn, _images(start))
+        best, (error, by_face) = start, judge.measure(start.drawn, start.maps)
         for number in range(1, rounds + 1):
             weight = weight * weights(merged.positions, merged.faces, by_face, self.visible)
             candidate = self.weighted(weight)
-            again, by_face = judge.measure(candidate.drawn, _images(candidate))
+            again, by_face = judge.measure(candidate.drawn, candidate.maps)
             log.info("triangles moved, round %d: squared error of the start %.3g -> %.3g", number, error, again)
             if again < WORTHWHILE * error:
                 best, error = candidate, again
@@ -210,7 +214,7 @@ class _Decimated:
         scale = np.ones(len(start.mesh.faces))
         # displaced vertices read the rim of a chart on both of its sides, which asks for the same texels everywhere
         if not self.options.displaced:
-            scale = chart_scales(start.mesh, _images(start), self.views)
+            scale = chart_scales(start.mesh, start.maps, self.views)
         return self._mapped(start.charts, scale, tight)
 
     def _mapped(self, charts: LatentMesh, scale: NDArray, tight: bool) -> Start:
@@ -219,8 +223,10 @@ class _Decimated:
         return replace(transferred(self.reference, mesh, options), charts=charts)
 
 
-def _images(start: Start) -> dict[str, NDArray]:
-    return {name: np.asarray(value) for name, value in start.maps.items() if np.ndim(value)}
+def told(reference: Reference, maps: Mapping[str, NDArray | float]) -> dict[str, NDArray | float]:
+    """Those of a start's maps that images of the reference tell of: where it is not lit, colours alone."""
+    unlit = isinstance(reference, MeshReference) and reference.unlit
+    return {**{n: maps[n] for n in COLORS}, UNLIT: 1.0} if unlit else dict(maps)
 
 
 def transferred(reference: MeshReference, mesh: LatentMesh, options: SimplifyOptions) -> Start:
@@ -234,7 +240,7 @@ def transferred(reference: MeshReference, mesh: LatentMesh, options: SimplifyOpt
     if missed > 0.01:
         log.warning("the transfer found no reference point for %.1f %% of the texels; they were filled", 100 * missed)
     maps = {n: v for n, v in result.maps.items() if options.normal_map or not n.startswith("normal")}
-    return Start(mesh, {**maps, **displacement}, True, result.covered, options.levels(), finest)
+    return Start(mesh, {**told(reference, maps), **displacement}, True, result.covered, options.levels(), finest)
 
 
 def sided(start: Start, single: NDArray[np.bool_]) -> Start:
@@ -262,7 +268,7 @@ def atlas_of(
     from appearance_opt.asset.normals import weld
     from appearance_opt.asset.sides import single_sided
 
-    parts = split(given, f"--init {options.init}", "start from")
+    parts = split(given, f"--init {options.init}", "start from", by_light=False)
     asset = parts.fitted
     most = None if options.triangles is None and options.ratio is None else budget(options, available)
     if most is not None and asset.triangle_count > most:

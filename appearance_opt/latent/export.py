@@ -11,7 +11,7 @@ from appearance_opt.asset.normals import split_where_cancelled, summed_normals
 from appearance_opt.asset.packing import EMISSION, pack_emission
 from appearance_opt.asset.tangents import split_and_tangents
 from appearance_opt.asset.types import Asset, Material, Mesh, Texture
-from appearance_opt.render.material import DEFAULTS
+from appearance_opt.render.material import DEFAULTS, UNLIT
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -97,6 +97,7 @@ def _material(maps: Mapping[str, NDArray | float], name: str) -> Material:
         base_color_texture=None if base is None else Texture(_srgb8(base), "srgb", clamp),  # type: ignore[arg-type]
         orm_texture=None if orm is None else Texture(_8(orm), "linear", clamp),  # type: ignore[arg-type]
         normal_texture=None if normal is None else Texture(_8(normal * 0.5 + 0.5), "linear", clamp),  # type: ignore[arg-type]
+        unlit=UNLIT in maps,
         emission=emission,
         emission_texture=emission_texture,
     )

@@ -13,7 +13,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from appearance_opt.render.material import TexelLayer
+from appearance_opt.render.material import CHANNELS, COLORS, MaterialMaps, TexelLayer
 from appearance_opt.render.texture import CLAMP, Pyramid, downsample, pyramid_layout
 
 if TYPE_CHECKING:
@@ -21,7 +21,6 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-COLORS = ("red", "green", "blue")
 BOUNDS = {
     **dict.fromkeys(COLORS, (0.0, 1.0)),
     "roughness": (0.08, 1.0),
@@ -147,3 +146,11 @@ def _flat(rows: list[mi.Float]) -> mi.Float:
     out = dr.empty(mi.Float, n * len(rows))
     dr.scatter(out, mi.ArrayXf(rows), dr.arange(mi.UInt32, n), mode=dr.ReduceMode.Permute)
     return out
+
+
+def maps_of(values: Mapping[str, NDArray | float]) -> MaterialMaps:
+    """Maps of one atlas for the renderer: of each channel an image (size, size), or a number, in natural units."""
+    images = {n: np.asarray(values[n]) for n in CHANNELS if n in values and np.ndim(values[n])}
+    codec = TexelCodec(tuple(images), len(next(iter(images.values()))))
+    constants = {n: float(v) for n, v in values.items() if not np.ndim(v)}
+    return MaterialMaps((codec.layer(codec.encode(images)),), constants)

@@ -18,7 +18,7 @@ from appearance_opt.reference.textures import coverage_maps, emission_maps, mate
 from appearance_opt.render import deferred, layers, upload
 from appearance_opt.render.deferred import Grid
 from appearance_opt.render.freezing import Frozen
-from appearance_opt.render.material import evaluate, shading_normal
+from appearance_opt.render.material import UNLIT, evaluate, shading_normal
 from appearance_opt.render.surface import Surface, face_normal, interpolate_at
 
 if TYPE_CHECKING:
@@ -85,6 +85,11 @@ class MeshReference:
         )
         self._run = Frozen(self.surface, self.maps, self.coverage)
         self._grid: Grid | None = None
+
+    @property
+    def unlit(self) -> bool:
+        """Does all of it show its base colour whatever the light?"""
+        return UNLIT in self.maps.constants
 
     def _needs_uvs(self) -> bool:
         """Does any material look up a texture?"""

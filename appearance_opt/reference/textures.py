@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import mitsuba as mi
 import numpy as np
 
 from appearance_opt.asset.alpha import coverage, kind_of
 from appearance_opt.asset.packing import EMISSION, resized
 from appearance_opt.render.layers import CHANNELS, Coverage
-from appearance_opt.render.material import MaterialMaps, TexelLayer
+from appearance_opt.render.material import COLORS, UNLIT, MaterialMaps, TexelLayer
 from appearance_opt.render.texture import CLAMP, MIRROR, REPEAT, build_pyramid
 
 if TYPE_CHECKING:
@@ -25,18 +26,24 @@ _FULL = (*_PLAIN, "normal_x", "normal_y", "normal_z")
 def material_maps(materials: list[Material]) -> MaterialMaps:
     """Maps of all materials in one pyramid of half precision, or constants when the only material has no texture.
 
-    Maps of one material that differ in size are brought to the largest of them.
+    Maps of one material that differ in size are brought to the largest of them. Where none of the materials is lit,
+    they have colours alone.
     """
+    unlit = [m.unlit for m in materials]
+    constants: dict[str, float] = {UNLIT: 1.0} if all(unlit) else {}
+    some = mi.Bool(unlit) if any(unlit) and not all(unlit) else None
     textured = [m for m in materials if _textures(m)]
     if not textured and len(materials) == 1:
         only = materials[0]
-        constants = dict(zip(_PLAIN, (*only.base_color, only.roughness, only.metalness), strict=True))
+        constants |= dict(zip(_PLAIN, (*only.base_color, only.roughness, only.metalness), strict=True))
         return MaterialMaps(constants=constants)
-    channels = _FULL if any(m.normal_texture is not None for m in materials) else _PLAIN
+    channels: tuple[str, ...] = _FULL if any(m.normal_texture is not None for m in materials) else _PLAIN
     bases = [_packed(m, channels is _FULL) for m in materials]
+    if all(unlit):
+        channels, bases = COLORS, [np.ascontiguousarray(b[..., :4]) for b in bases]
     # a material's maps share one wrap mode here: horizontal wrap of its first texture
     wraps = [_WRAP[_textures(m)[0].wrap[0]] if _textures(m) else REPEAT for m in materials]
-    return MaterialMaps((TexelLayer(channels, build_pyramid(bases, wraps).halved()),))
+    return MaterialMaps((TexelLayer(channels, build_pyramid(bases, wraps).halved()),), constants, some)
 
 
 def emission_maps(materials: list[Material]) -> MaterialMaps | None:

@@ -28,13 +28,15 @@ a hundred times as large as all others."""
 @dataclass
 class MaterialSample:
     """Material at each sample. ``base_color``: linear. ``normal``: tangent-space normal, not
-    normalised, or None without a normal map. ``gamma``: specular attenuation or None."""
+    normalised, or None without a normal map. ``gamma``: specular attenuation or None. ``unlit``: shown in its base
+    colour: by sample, or True for all of them."""
 
     base_color: mi.Color3f
     roughness: mi.Float
     metalness: mi.Float
     normal: mi.Vector3f | None = None
     gamma: mi.Float | None = None
+    unlit: mi.Bool | bool = False
 
 
 def reflect(material: MaterialSample, n: mi.Vector3f, v: mi.Vector3f, l: mi.Vector3f) -> mi.Color3f:  # noqa: E741

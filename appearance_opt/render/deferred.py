@@ -67,12 +67,15 @@ def shade(
     camera = rays.camera_of(records, samples.view)
     hit = interpolate(surface, camera, samples, resolution, width)
     sample = material.evaluate(maps, hit)
+    if sample.unlit is True:
+        return sample.base_color
     normal = material.shading_normal(hit, sample)
     to_light = camera.light - hit.position
     squared_distance = at_least(dr.squared_norm(to_light), NEAREST_LIGHT**2)
     to_light *= dr.rsqrt(squared_distance)
     irradiance = camera.intensity / squared_distance
-    return brdf.reflect(sample, normal, hit.to_viewer, to_light) * irradiance
+    lit = brdf.reflect(sample, normal, hit.to_viewer, to_light) * irradiance
+    return lit if sample.unlit is False else dr.select(sample.unlit, sample.base_color, lit)
 
 
 def pixel_index(samples: Samples, resolution: mi.UInt32) -> mi.UInt32:

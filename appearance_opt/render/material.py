@@ -22,6 +22,11 @@ from appearance_opt.render.texture import Pyramid
 if TYPE_CHECKING:
     from appearance_opt.render.surface import Hit
 
+UNLIT = "unlit"
+"""The constant of maps whose surface shows its base colour whatever the light."""
+
+COLORS = ("red", "green", "blue")
+
 CHANNELS = ("red", "green", "blue", "roughness", "metalness", "normal_x", "normal_y", "normal_z", "gamma")
 """Every channel a material can have. Colours are linear, normals in [-1, 1], all three of their channels or none."""
 
@@ -50,10 +55,13 @@ class TexelLayer:
 @dataclass(frozen=True)
 class MaterialMaps:
     """Everything that is known of the materials of a surface: ``layers`` of maps (a fit keeps the maps
-    that move and those that do not in different layers) and ``constants`` for the channels without one."""
+    that move and those that do not in different layers) and ``constants`` for the channels without one. ``unlit``:
+    which of several materials are shown without light, None if none is; all of them are with the constant
+    ``UNLIT``."""
 
     layers: tuple[TexelLayer, ...] = ()
     constants: Mapping[str, float] = field(default_factory=dict)
+    unlit: mi.Bool | None = None
 
     @property
     def has_normal_map(self) -> bool:
@@ -71,7 +79,10 @@ def evaluate(maps: MaterialMaps, hit: Hit) -> MaterialSample:
     normal = None
     if maps.has_normal_map:
         normal = mi.Vector3f(value["normal_x"], value["normal_y"], value["normal_z"])
-    return MaterialSample(base, value["roughness"], value["metalness"], normal, value.get("gamma"))
+    unlit: mi.Bool | bool = UNLIT in maps.constants
+    if maps.unlit is not None:
+        unlit = dr.gather(mi.Bool, maps.unlit, hit.material)
+    return MaterialSample(base, value["roughness"], value["metalness"], normal, value.get("gamma"), unlit)
 
 
 def shading_normal(hit: Hit, sample: MaterialSample) -> mi.Vector3f:
