@@ -16,6 +16,7 @@ from appearance_opt.config import BakeOptions, SimplifyOptions
 from appearance_opt.fit.losses import LOSSES
 from appearance_opt.fit.model import TEXELS, Model, Rates
 from appearance_opt.fit.step import Gradients
+from appearance_opt.jobs.inspect import inspect
 from appearance_opt.reference.mesh import MeshReference
 from appearance_opt.render.deferred import Grid
 from appearance_opt.render.gradient import Quality
@@ -169,3 +170,16 @@ def test_metallic_and_roughness_of_unlit_files_mean_nothing(tmp_path: Path) -> N
     assert '"KHR_materials_unlit"' in text
     (tmp_path / "x.gltf").write_text(text.replace('"metallicFactor": 0.0', '"metallicFactor": 1.0'))
     assert load(tmp_path / "x.gltf").meshes[0].material.metalness == 0
+
+
+def test_inspect_says_what_becomes_of_unlit_parts(tmp_path: Path) -> None:
+    lit, sign = make_asset(8, 16).meshes[0], ball(Material("sign", COLOR, unlit=True), 3.0)
+    save(Asset((lit, sign)), tmp_path / "mixed.glb")
+    save(Asset((sign,)), tmp_path / "all.glb")
+    mixed, alone = (inspect(tmp_path / f"{name}.glb") for name in ("mixed", "all"))
+    assert {m.name: (m.seen, m.simplify) for m in mixed.materials} == {
+        "painted": ("opaque", "fitted"),
+        "sign": ("opaque, unlit", "kept as it is"),
+    }
+    assert mixed.alpha["unlit"].becomes == "kept as it is"
+    assert (alone.materials[0].simplify, alone.alpha["unlit"].becomes) == ("fitted", "fitted")

@@ -23,6 +23,9 @@ if TYPE_CHECKING:
     from appearance_opt.asset.types import Asset, Material, Mesh
 
 Kind = Literal["opaque", "mask", "blend", "transmission"]
+UNLIT = "unlit"
+"""What is opaque and unlit, beside the kinds."""
+
 KINDS: tuple[Kind, ...] = get_args(Kind)
 
 OPAQUE = 1 - 1.5 / 255
@@ -85,12 +88,23 @@ class Share:
     becomes: str
 
 
-def counted(asset: Asset) -> dict[Kind, Share]:
-    """The share of each kind that an asset has."""
-    found = [(kind_of(m.material), len(m.faces)) for m in asset.meshes]
-    shares = {kind: [count for k, count in found if k == kind] for kind in KINDS}
-    becomes = {kind: FITTED if kind == "opaque" else KEPT for kind in KINDS}
-    return {k: Share(len(n), sum(n), becomes[k]) for k, n in shares.items() if n}
+def kept_apart(asset: Asset, by_light: bool = True) -> list[bool]:
+    """Which meshes take no part in a fit of an asset that is ``settled``: those that are seen through, and
+    (``by_light``) unlit ones, unless all that is opaque is unlit, for one result cannot be both."""
+    clear = [seen_through(m) for m in asset.meshes]
+    lit = any(not m.material.unlit for m, out in zip(asset.meshes, clear, strict=True) if not out)
+    return [out or (by_light and lit and m.material.unlit) for m, out in zip(asset.meshes, clear, strict=True)]
+
+
+def counted(asset: Asset) -> dict[str, Share]:
+    """The share of each kind that an asset has; what is unlit is told apart."""
+    apart = kept_apart(asset)
+    found: dict[str, list[tuple[int, bool]]] = {kind: [] for kind in ("opaque", UNLIT, *KINDS[1:])}
+    for mesh, out in zip(asset.meshes, apart, strict=True):
+        kind = kind_of(mesh.material)
+        found[UNLIT if kind == "opaque" and mesh.material.unlit else kind].append((len(mesh.faces), out))
+    becomes = {kind: KEPT if any(out for _, out in n) else FITTED for kind, n in found.items()}
+    return {k: Share(len(n), sum(count for count, _ in n), becomes[k]) for k, n in found.items() if n}
 
 
 def settled(asset: Asset) -> Asset:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from appearance_opt.asset import load
-from appearance_opt.asset.alpha import FITTED, KEPT, Share, counted, kind_of, settled
+from appearance_opt.asset.alpha import FITTED, KEPT, UNLIT, Share, counted, kept_apart, kind_of, settled
 from appearance_opt.asset.types import Contents, Texture
 from appearance_opt.asset.validate import Validation, inspected
 
@@ -50,7 +50,8 @@ class MapFacts:
 
 @dataclass(frozen=True)
 class MaterialFacts:
-    """``seen``: opaque, mask, blend or transmission; ``simplify``: what it does with the meshes that wear it."""
+    """``seen``: opaque, mask, blend or transmission, and whether it is unlit; ``simplify``: what it does with the meshes
+    that wear it."""
 
     name: str
     meshes: int
@@ -144,7 +145,7 @@ def inspect(
         textures=len(textures),
         texture_bytes=sum(t.nbytes for t in textures),
         contents=asset.contents,
-        alpha={str(kind): share for kind, share in counted(parts).items()},
+        alpha=counted(parts),
         notes=parts.notes,
     )
 
@@ -158,22 +159,23 @@ def _textures(materials: Any) -> list[np.ndarray]:
 def _materials(asset: Asset) -> tuple[MaterialFacts, ...]:
     """The materials in the order of their triangles."""
     wearers: dict[int, list[Mesh]] = {}
-    for mesh in asset.meshes:
+    kept: dict[int, bool] = {}
+    for mesh, out in zip(asset.meshes, kept_apart(asset), strict=True):
         wearers.setdefault(id(mesh.material), []).append(mesh)
-    facts = [_facts(meshes[0].material, meshes) for meshes in wearers.values()]
+        kept[id(mesh.material)] = out
+    facts = [_facts(meshes[0].material, meshes, kept[key]) for key, meshes in wearers.items()]
     return tuple(sorted(facts, key=lambda m: -m.triangles))
 
 
-def _facts(material: Material, meshes: Sequence[Mesh]) -> MaterialFacts:
-    kind = kind_of(material)
+def _facts(material: Material, meshes: Sequence[Mesh], kept: bool) -> MaterialFacts:
     given = ((name, getattr(material, name)) for name in MAPS)
     return MaterialFacts(
         name=material.name,
         meshes=len(meshes),
         triangles=sum(len(m.faces) for m in meshes),
-        seen=kind,
+        seen=kind_of(material) + (f", {UNLIT}" if material.unlit else ""),
         double_sided=material.double_sided,
-        simplify=FITTED if kind == "opaque" else KEPT,
+        simplify=KEPT if kept else FITTED,
         maps=tuple(_map_facts(MAPS[name], texture) for name, texture in given if texture is not None),
     )
 

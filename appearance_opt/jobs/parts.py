@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from appearance_opt.asset.alpha import listed, seen_through, settled
+from appearance_opt.asset.alpha import kept_apart, listed, seen_through, settled
 from appearance_opt.errors import InputError
 
 if TYPE_CHECKING:
@@ -48,14 +48,10 @@ class Parts:
 
 
 def split(asset: Asset, name: str, job: str, by_light: bool = True) -> Parts:
-    """Opaque meshes are fitted, transparent ones kept; so are unlit ones, unless all that is opaque is unlit, for one
-    result cannot be both (``by_light``). Raises InputError if nothing is left to fit. ``name`` of the asset, and what
-    the ``job`` does to it, for the message."""
+    """What a job works on, and what it keeps (see ``alpha.kept_apart``). Raises InputError if nothing is left to fit.
+    ``name`` of the asset, and what the ``job`` does to it, for the message."""
     asset = settled(asset)
-    apart = [seen_through(m) for m in asset.meshes]
-    opaque = [m for m, out in zip(asset.meshes, apart, strict=True) if not out]
-    if by_light and not all(m.material.unlit for m in opaque):
-        apart = [out or m.material.unlit for m, out in zip(asset.meshes, apart, strict=True)]
+    apart = kept_apart(asset, by_light)
     kept = tuple(m for m, out in zip(asset.meshes, apart, strict=True) if out)
     fitted = tuple(m for m, out in zip(asset.meshes, apart, strict=True) if not out)
     if not fitted:
