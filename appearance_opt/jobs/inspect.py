@@ -50,7 +50,7 @@ class MapFacts:
 
 @dataclass(frozen=True)
 class MaterialFacts:
-    """``seen``: opaque, mask, blend or transmission, and whether it is unlit; ``simplify``: what it does with the meshes
+    """``seen``: opaque, mask, blend or transmission, and if it is unlit; ``simplify``: what it does with the meshes
     that wear it."""
 
     name: str
