@@ -5,11 +5,13 @@ from __future__ import annotations
 import ctypes.util
 import gc
 import glob
+import math
 import os
 import platform
 import sys
 from dataclasses import dataclass
 from importlib import metadata
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from appearance_opt.errors import BackendError
@@ -21,6 +23,9 @@ if TYPE_CHECKING:
 CPU, CUDA = "llvm_ad_rgb", "cuda_ad_rgb"
 MINIMUM_LLVM = 15
 """Oldest LLVM that compiles our kernels (checked: 15, 16, 19)."""
+
+THREADS = "APPEARANCE_OPT_THREADS"
+"""Environment variable: at most so many threads compute on the CPU."""
 
 
 @dataclass(frozen=True)
@@ -52,9 +57,40 @@ def select(device: str = "auto") -> Backend:
         version = ".".join(str(n) for n in numbers)
         if numbers[0] < MINIMUM_LLVM:
             raise BackendError(f"libLLVM {version} is too old ({MINIMUM_LLVM} or newer is needed): {install_hint()}")
+    _limit_threads()
     if mi.variant() != variant:
         mi.set_variant(variant)
     return Backend(variant, version, dr.thread_count(), cuda)
+
+
+def cores() -> int:
+    """Processor cores that this process may run on: ``taskset`` and cpusets count."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _limit_threads() -> None:
+    """Let Dr.Jit (and Mitsuba's Embree, which shares its threads) take no more threads than ``THREADS`` says, or than
+    a container's share of the processors (cgroup v2) can run at a time: more would wait for each other."""
+    import drjit as dr
+
+    given = os.environ.get(THREADS, "").strip()
+    if given:
+        if not given.isdecimal() or int(given) < 1:
+            raise BackendError(f"{THREADS}={given}: must be a whole number of threads, at least 1")
+        limit = min(int(given), cores())
+    else:
+        limit = min(dr.thread_count(), _processor_quota(Path("/sys/fs/cgroup/cpu.max")) or dr.thread_count())
+    if dr.thread_count() != limit:
+        dr.set_thread_count(limit)
+
+
+def _processor_quota(file: Path) -> int | None:
+    """Processors, rounded up, that a container may use at a time, or None where there is no limit."""
+    try:
+        quota, period = file.read_text().split()
+        return max(1, math.ceil(int(quota) / int(period)))
+    except (OSError, ValueError, ZeroDivisionError):  # "max", or another system
+        return None
 
 
 def to_device(array: NDArray) -> mi.Float:

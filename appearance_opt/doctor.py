@@ -12,7 +12,7 @@ from appearance_opt.errors import BackendError
 def diagnose() -> dict[str, object]:
     """Facts by name; ``problem`` is empty, or says what to install."""
     facts: dict[str, object] = {"system": f"{platform.system()} {platform.release()} {platform.machine()}"}
-    facts["cores"] = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    facts["cores"] = backend.cores()
     facts["memory"] = _memory()
     facts.update(backend.versions())
     try:
@@ -21,6 +21,7 @@ def diagnose() -> dict[str, object]:
             backend=found.variant,
             llvm=found.llvm or "not used",
             threads=found.threads,
+            thread_limit=os.environ.get(backend.THREADS, "").strip() or f"none ({backend.THREADS} sets one)",
             cuda="found" if found.cuda else "not found (optional)",
             problem="",
         )

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
+import drjit as dr
 import numpy as np
 import pytest
 
 from appearance_opt import backend
 from appearance_opt.asset.types import Asset, Material, Mesh, Texture
+from tests import looks
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -19,6 +22,26 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 def variant(request: pytest.FixtureRequest) -> str:
     """All tests share one variant."""
     return backend.select(request.config.getoption("--device")).variant
+
+
+@pytest.fixture(scope="session", autouse=True)
+def small_looks(variant: str) -> Iterator[None]:
+    """Jobs look at few and small views; see ``tests.looks``."""
+    before = looks.make_small()
+    yield
+    looks.restore(before)
+
+
+@pytest.fixture
+def one_thread(variant: str) -> Iterator[float]:
+    """On the CPU one thread alone computes, so that sums come in one order and equal fits end bit by bit equal. Hands
+    out how far they may end apart: on a GPU, threads add up gradients in any order, and Adam makes a whole step of the
+    sign of a vanishing one."""
+    before = dr.thread_count()
+    if variant == backend.CPU:
+        dr.set_thread_count(1)
+    yield 0.0 if variant == backend.CPU else 2e-2
+    dr.set_thread_count(before)
 
 
 @pytest.fixture(scope="session")

@@ -10,21 +10,39 @@ from pathlib import Path
 import pytest
 
 import appearance_opt
-from appearance_opt import config
+from appearance_opt import backend, config
 from appearance_opt.asset import save
 from appearance_opt.asset.types import Asset
 from appearance_opt.errors import InputError
+from tests.looks import COMMAND, ENVIRONMENT
 
 
-def run(*arguments: str, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "appearance_opt", *arguments]
-    return subprocess.run(command, capture_output=True, text=True, cwd=cwd, timeout=300)
+def run(
+    *arguments: str, cwd: Path | None = None, small: bool = False, **environment: str
+) -> subprocess.CompletedProcess[str]:
+    """``small``: with the small looks of ``tests.looks``."""
+    start = ["-c", COMMAND] if small else ["-m", "appearance_opt"]
+    return subprocess.run(
+        [sys.executable, *start, *arguments],
+        capture_output=True, text=True, cwd=cwd, env={**ENVIRONMENT, **environment},
+    )  # fmt: skip
 
 
 def test_simplify_and_compare_as_a_user_would(ball: Asset, tmp_path: Path) -> None:
     save(ball, tmp_path / "ball.glb")
     (tmp_path / "job.toml").write_text('texture-size = 64\nresolution = 48\npool = 8\nsteps = 4\nbudget = "2m"\n')
-    done = run("simplify", "ball.glb", "--triangles", "150", "--out", "low.glb", "--config", "job.toml", cwd=tmp_path)
+    done = run(
+        "simplify",
+        "ball.glb",
+        "--triangles",
+        "150",
+        "--out",
+        "low.glb",
+        "--config",
+        "job.toml",
+        cwd=tmp_path,
+        small=True,
+    )
     assert done.returncode == 0, done.stderr
     assert "of 2208 triangles" in done.stdout
     assert (tmp_path / "low.report" / "report.html").is_file()
@@ -93,6 +111,25 @@ def test_doctor_and_version() -> None:
     assert done.returncode == 0
     assert json.loads(done.stdout)["problem"] == ""
     assert appearance_opt.__version__ in run("--version").stdout
+
+
+def test_threads_are_limited_by_the_environment() -> None:
+    done = run("doctor", "--json", APPEARANCE_OPT_THREADS="1")
+    assert done.returncode == 0, done.stderr
+    assert (json.loads(done.stdout)["threads"], json.loads(done.stdout)["thread_limit"]) == (1, "1")
+    for nonsense in ("0", "many"):
+        refused = run("doctor", APPEARANCE_OPT_THREADS=nonsense)
+        assert refused.returncode == 2
+        assert f"APPEARANCE_OPT_THREADS={nonsense}: must be a whole number" in refused.stderr
+
+
+@pytest.mark.parametrize(
+    ("content", "count"), [("200000 100000\n", 2), ("150000 100000\n", 2), ("5000 100000\n", 1), ("max 100000\n", None)]
+)
+def test_a_containers_quota_is_known(tmp_path: Path, content: str, count: int | None) -> None:
+    (tmp_path / "cpu.max").write_text(content)
+    assert backend._processor_quota(tmp_path / "cpu.max") == count
+    assert backend._processor_quota(tmp_path / "absent") is None
 
 
 def test_help_imports_nothing_heavy() -> None:

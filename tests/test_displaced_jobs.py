@@ -23,9 +23,9 @@ from appearance_opt.fit.loop import FitOptions, level_of
 from appearance_opt.fit.model import POSITIONS, TEXELS, Model, Rates
 from appearance_opt.fit.validation import Validation
 from appearance_opt.initial.sphere import sphere
-from appearance_opt.jobs.displaced import REACH, displaced, map_size, median_edge, without_outliers
+from appearance_opt.jobs.displaced import REACH, displaced, map_size, median_edge, without_outliers, write_companion
 from appearance_opt.jobs.joint import joint
-from appearance_opt.jobs.simplify import simplify
+from appearance_opt.jobs.simplify import SimplifyResult, simplify
 from appearance_opt.latent.displacement import DISPLACEMENT, Tessellator, footprint
 from appearance_opt.latent.subdivision import tessellate
 from appearance_opt.latent.texels import TexelCodec
@@ -44,7 +44,19 @@ def options(**values: object):
 
 @pytest.fixture(scope="module")
 def bumpy() -> Asset:
-    return bumpy_sphere(20_000)
+    return bumpy_sphere(6_000)
+
+
+@pytest.fixture(scope="module")
+def relief(bumpy: Asset) -> SimplifyResult:
+    """A start with a displacement map."""
+    return simplify(bumpy, None, options(steps=0))
+
+
+@pytest.fixture(scope="module")
+def flat(bumpy: Asset) -> SimplifyResult:
+    """A start of as many triangles without one."""
+    return simplify(bumpy, None, simplify_options(triangles=200, **{**QUICK, "steps": 0}))
 
 
 def test_levels_are_read_in_every_way_and_checked() -> None:
@@ -84,8 +96,8 @@ def test_free_memory_is_known() -> None:
     assert free is not None and 2**20 < free < 2**50
 
 
-def test_the_map_is_as_fine_as_the_mesh() -> None:
-    mesh = movable(prepare(load_ball()).mesh)
+def test_the_map_is_as_fine_as_the_mesh(relief: SimplifyResult) -> None:
+    mesh = movable(prepare(relief.asset).mesh)
     size = map_size(mesh, options(texture_size=1024))
     texels = size * np.sqrt(np.median(footprint(tessellate(mesh, 3).mesh)))
     assert 1 <= texels < 2  # texels per half edge of the finest mesh
@@ -117,10 +129,6 @@ def test_lone_heights_give_way_and_walls_stay() -> None:
     clean = without_outliers(spiked, 0.1)
     np.testing.assert_allclose(clean, heights, atol=0.1)
     np.testing.assert_array_equal(clean[heights == spiked], heights[heights == spiked])
-
-
-def load_ball() -> Asset:
-    return simplify(bumpy_sphere(5_000), None, options(steps=0)).asset
 
 
 def test_files_of_a_displaced_result(bumpy: Asset, tmp_path: Path) -> None:
@@ -166,36 +174,32 @@ def _png(path: Path) -> np.ndarray:
     return pixels
 
 
-def test_displacement_in_usd_and_obj(bumpy: Asset, tmp_path: Path) -> None:
+def test_displacement_in_usd_and_obj(relief: SimplifyResult, tmp_path: Path) -> None:
     from pxr import Usd, UsdShade
 
-    result = simplify(bumpy, tmp_path / "low.usda", options(steps=0))
+    save(relief.asset, tmp_path / "low.usda")
     stage = Usd.Stage.Open(str(tmp_path / "low.usda"))
     materials = [UsdShade.Material(p) for p in stage.Traverse() if p.IsA(UsdShade.Material)]
     assert materials[0].GetDisplacementOutput().HasConnectedSource()
-    save(result.asset, tmp_path / "again.usda")
-    simplify(bumpy, tmp_path / "low.obj", options(steps=0))
+    write_companion(relief.asset, tmp_path / "low.obj")
     assert _png(tmp_path / "low_displacement.png").shape[2] == 1
 
 
-def test_what_is_not_there_has_no_parameter(bumpy: Asset) -> None:
+def test_what_is_not_there_has_no_parameter(bumpy: Asset, flat: SimplifyResult) -> None:
     result = simplify(bumpy, None, options(steps=0, normal_map=False))
     assert result.asset.meshes[0].material.normal_texture is None
     assert result.asset.meshes[0].material.displacement is not None
-    plain = simplify(bumpy, None, simplify_options(triangles=200, **{**QUICK, "steps": 0}))
-    assert plain.asset.meshes[0].material.displacement is None and not plain.tessellated
+    assert flat.asset.meshes[0].material.displacement is None and not flat.tessellated
     mesh = movable(prepare(result.asset).mesh)
-    flat = np.zeros((16, 16), np.float32)
-    maps = {"red": flat, "displacement": flat}
+    level = np.zeros((16, 16), np.float32)
+    maps = {"red": level, "displacement": level}
     assert set(Model(mesh, maps, frozenset({"displacement"}), Rates(), (1,)).parameters) == {DISPLACEMENT}
     assert set(Model(mesh, maps, frozenset({"shape", "material"}), Rates(), (1,)).parameters) == {POSITIONS, TEXELS}
 
 
-def test_the_closed_form_start_wins_back_the_bumps(bumpy: Asset) -> None:
+def test_the_closed_form_start_wins_back_the_bumps(flat: SimplifyResult, relief: SimplifyResult) -> None:
     """Bumps that 200 triangles cannot have: distance of the drawn faces from the true surface, along the radius."""
-    flat = simplify(bumpy, None, simplify_options(triangles=200, **{**QUICK, "steps": 0})).asset
-    relief = simplify(bumpy, None, options(steps=0)).shown
-    error = [_radial_error(flat), _radial_error(relief)]
+    error = [_radial_error(flat.asset), _radial_error(relief.shown)]
     assert error[1] < error[0] / 4, error
 
 
@@ -206,8 +210,8 @@ def _radial_error(asset: Asset) -> float:
     return float(np.mean(np.abs(radius - bumps(centre / radius[:, None]))))
 
 
-def test_a_file_to_start_from_brings_its_triangles(bumpy: Asset, tmp_path: Path) -> None:
-    simplify(bumpy, tmp_path / "bad.glb", simplify_options(triangles=150, **{**QUICK, "steps": 0}))
+def test_a_file_to_start_from_brings_its_triangles(bumpy: Asset, flat: SimplifyResult, tmp_path: Path) -> None:
+    save(flat.asset, tmp_path / "bad.glb")
     o = simplify_options(init=str(tmp_path / "bad.glb"), displacement=True, subdivision=1, **QUICK)
     result = simplify(bumpy, tmp_path / "x.glb", o)
     assert result.triangles == load(tmp_path / "bad.glb").triangle_count
@@ -217,8 +221,8 @@ def test_a_file_to_start_from_brings_its_triangles(bumpy: Asset, tmp_path: Path)
 def test_changing_levels_compiles_nothing_after_the_first_steps(bumpy: Asset) -> None:
     reference = MeshReference(bumpy)
     sampler = ViewSampler((0.0, 0.0, 0.0), 1.4, seed=1)
-    flat = np.zeros((32, 32), np.float32)
-    maps = {"red": flat + 0.5, "green": flat + 0.5, "blue": flat + 0.5, DISPLACEMENT: flat}
+    level = np.zeros((32, 32), np.float32)
+    maps = {"red": level + 0.5, "green": level + 0.5, "blue": level + 0.5, DISPLACEMENT: level}
     mesh = sphere(150, (0.0, 0.0, 0.0), 1.0, 32)
     model = Model(mesh, maps, frozenset({"shape", "material", DISPLACEMENT}), Rates(), (1, 2))
     validation = Validation(reference, sampler.held_out(1).draw(0, 2), 32)
@@ -229,14 +233,14 @@ def test_changing_levels_compiles_nothing_after_the_first_steps(bumpy: Asset) ->
     assert levels == {1, 2}  # the clean steps changed levels
 
 
-def test_joint_bake_keeps_topology_and_texture_coordinates(bumpy: Asset, tmp_path: Path) -> None:
-    low = simplify(bumpy, tmp_path / "low.glb", simplify_options(triangles=200, **{**QUICK, "steps": 0})).asset
+def test_joint_bake_keeps_topology_and_texture_coordinates(bumpy: Asset, flat: SimplifyResult, tmp_path: Path) -> None:
+    save(flat.asset, tmp_path / "low.glb")
     o = bake_options(joint=True, subdivision="2", samples=1, **QUICK)
     result = joint(bumpy, tmp_path / "low.glb", tmp_path / "out.usda", o)
     before, after = load(tmp_path / "low.glb").meshes[0], result.asset.meshes[0]
-    assert len(after.faces) == len(before.faces) == low.triangle_count
+    assert len(after.faces) == len(before.faces) == flat.triangles
     np.testing.assert_array_equal(after.uvs[after.faces], before.uvs[before.faces])
     moved = np.linalg.norm(after.positions[after.faces] - before.positions[before.faces], axis=-1)
     assert 0 < moved.max() < 0.05  # a few steps
-    assert result.shown.triangle_count == 16 * low.triangle_count
+    assert result.shown.triangle_count == 16 * flat.triangles
     assert (tmp_path / "out.usda").is_file() and after.material.displacement is not None

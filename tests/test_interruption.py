@@ -7,7 +7,6 @@ never at a time: how far a run is after some seconds depends on the machine and 
 from __future__ import annotations
 
 import json
-import os
 import signal
 import subprocess
 import sys
@@ -23,27 +22,15 @@ from appearance_opt.errors import InputError
 from appearance_opt.jobs.paths import Outputs
 from appearance_opt.render.freezing import Frozen
 from tests.conftest import make_asset
+from tests.looks import COMMAND, ENVIRONMENT
 
 JOB = [
     "simplify", "in.glb", "--triangles", "150", "--texture-size", "32", "--resolution", "32",
     "--pool", "4", "--views", "2", "--reallocate", "0", "--device", "cpu",
 ]  # fmt: skip
 
-# the package beside these tests, whatever is installed
-ENVIRONMENT = {**os.environ, "PYTHONPATH": str(Path(__file__).resolve().parents[1])}
-
 HANGS = 1200
 """Seconds after which a run counts as hanging, however busy the machine."""
-
-# what the installed command runs, with small reports. `python -m` ends by the signal itself, whatever the exit code,
-# when the interrupt came while a C extension ran Python code
-COMMAND = """
-import sys
-from appearance_opt.jobs import report
-report.VIEWS, report.RESOLUTION = 2, 64
-from appearance_opt.cli import main
-sys.exit(main())
-"""
 
 # sends itself a signal just before a file gets its final name, or just before a module is loaded
 AT_EVENT = """

@@ -57,31 +57,24 @@ def test_the_error_of_a_start_is_found_where_it_is(bumps: MeshReference) -> None
     assert rise[u > 0.3].sum() > 3 * rise[u < -0.3].sum()
 
 
-def starts_of(reference: MeshReference) -> list[tuple[float, float]]:
-    """(squared error, share of the triangles on the side of +x) without and with a round of moving triangles."""
-    judge = StartError(reference, SAMPLER.held_out(3))
-    out = []
+def test_the_best_start_of_all_rounds_is_kept(bumps: MeshReference) -> None:
+    judge = StartError(bumps, SAMPLER.held_out(3), views=16)
+    error = []
     for rounds in (0, 1):
         options = simplify_options(triangles=500, texture_size=128, reallocate=rounds)
-        start = make_start(reference, options, SAMPLER, 500)
+        start = make_start(bumps, options, SAMPLER, 500)
         assert len(start.mesh.faces) <= 500
-        right = start.mesh.positions[start.mesh.faces].mean(axis=1)[:, 0] > 0
-        out.append((judge.measure(start.mesh, start.maps)[0], float(right.mean())))
-    return out
+        error.append(judge.measure(start.mesh, start.maps)[0])
+    # by other views than those that it was chosen by
+    assert error[1] < 1.02 * error[0]
 
 
-def test_the_best_start_of_all_rounds_is_kept(bumps: MeshReference) -> None:
-    (before, _), (after, _) = starts_of(bumps)
-    assert after <= before
-
-
-def test_triangles_move_to_where_something_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("appearance_opt.jobs.start.WORTHWHILE", 2.0)  # the moved ones are taken, whatever they gain
-    asset = bumpy_sphere(20_000, 128)
+def black_on(side: float) -> MeshReference:
+    """Bumps of the same heights all around, but the side of -x or +x is black: whatever its shape, little is seen."""
+    asset = bumpy_sphere(5_000, 128)
     (mesh,) = asset.meshes
-    # bumps of the same heights all around, but the side of -x is black: whatever its shape, little of it is seen
     texel = (np.arange(128) + 0.5) / 128 * 2 - 1
-    black = np.broadcast_to(texel < 0, (128, 128))
+    black = np.broadcast_to(side * texel > 0, (128, 128))
     assert mesh.material.base_color_texture is not None
     pixels = np.where(black[..., None], 0, mesh.material.base_color_texture.pixels).astype(np.uint8)
     material = replace(
@@ -89,8 +82,20 @@ def test_triangles_move_to_where_something_is_seen(monkeypatch: pytest.MonkeyPat
         base_color_texture=replace(mesh.material.base_color_texture, pixels=pixels),
         orm_texture=None, roughness=1.0, metalness=0.0,
     )  # fmt: skip
-    (_, share), (_, moved) = starts_of(MeshReference(replace(asset, meshes=(replace(mesh, material=material),))))
-    assert moved > share + 0.03
+    return MeshReference(replace(asset, meshes=(replace(mesh, material=material),)))
+
+
+def test_triangles_move_to_where_something_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("appearance_opt.jobs.start.WORTHWHILE", 2.0)  # the moved ones are taken, whatever they gain
+    monkeypatch.setattr("appearance_opt.initial.reallocate.RESOLUTION", 128)
+    share = []
+    for side in (-1.0, 1.0):
+        start = make_start(
+            black_on(side), simplify_options(triangles=300, texture_size=128, reallocate=1), SAMPLER, 300
+        )
+        share.append(float((start.mesh.positions[start.mesh.faces].mean(axis=1)[:, 0] > 0).mean()))
+    # the same shape: what differs is where the black is. Measured 0.06 to 0.08 with other views
+    assert share[0] > share[1] + 0.02
 
 
 @pytest.mark.parametrize(
