@@ -46,8 +46,8 @@ _UVS = "uvs:"
 """Before the name of a primvar of texture coordinates, among the attributes of a mesh."""
 
 
-MOST = 160
-"""Characters of what USD says that are handed on."""
+_ADDRESS = re.compile(r" \(instantiating stage .*$")
+"""What USD adds to its warnings: the same for all of them, and an address in memory."""
 
 
 def load_usd(
@@ -75,8 +75,10 @@ def load_usd(
     finally:
         warned = [_text(partial(getattr, w, "commentary")) for w in diagnostics.TakeUncoalescedDiagnostics()]
     told = Notes()
-    for text in warned:  # of one kind are those that differ in paths and names of files only
-        told(f"USD: {text[:MOST]}", re.sub(r"<[^>]*>|@[^@]*@|'[^']*'", "...", text)[:MOST])
+    for warning in warned:
+        text = _ADDRESS.sub("", warning)
+        # of one kind are those that differ in paths and names of files only
+        told(f"USD: {text}", re.sub(r"<[^>]*>|@[^@]*@|'[^']*'", "...", text))
     return replace(asset, notes=asset.notes + told.lines())
 
 
