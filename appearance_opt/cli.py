@@ -379,6 +379,7 @@ def inspect(
         variants=_variants(variant),
         missing_textures=missing_textures,  # type: ignore[arg-type]
         root=root,
+        crease_angle=crease_angle,
     )
     if as_json:
         import json

@@ -9,6 +9,7 @@ import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
+from appearance_opt.asset.batch import Batch
 from appearance_opt.asset.normals import weld
 from appearance_opt.asset.types import Displacement, Texture
 
@@ -25,6 +26,15 @@ as thick as it is wide. A ball has 0.094."""
 def single_sided(meshes: tuple[Mesh, ...]) -> NDArray[np.bool_]:
     """(F,) faces of all meshes, one mesh after the other, that are seen from their front only."""
     return np.repeat([not m.material.double_sided for m in meshes], [len(m.faces) for m in meshes])
+
+
+def counted(meshes: tuple[Mesh, ...]) -> tuple[int, int]:
+    """(single-sided faces, those among them whose backs may come into sight: see ``culled``)."""
+    single, batch = single_sided(meshes), Batch(meshes)
+    if not single.any():
+        return 0, 0
+    in_sight = culled(batch.joined("positions"), batch.faces, single)
+    return int(single.sum()), 0 if in_sight is None else int(in_sight.sum())
 
 
 def apart_from_sides(material: Material) -> tuple:

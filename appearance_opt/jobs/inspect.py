@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from appearance_opt.asset import load
+from appearance_opt.asset import load, sides
 from appearance_opt.asset.alpha import FITTED, KEPT, UNLIT, Share, counted, kept_apart, kind_of, settled
 from appearance_opt.asset.types import Contents, Texture
 from appearance_opt.asset.validate import Validation, inspected
@@ -65,7 +65,9 @@ class MaterialFacts:
 @dataclass(frozen=True)
 class Inspection:
     """``size``: extent along x, y, z in metres; ``origin``: see ``Asset``; ``file_bytes``: of the ``files`` that the
-    asset is made of; ``texture_bytes``: of their pixels as they are stored here, uncompressed, without mip levels."""
+    asset is made of; ``single_sided``: triangles that are fitted and seen from one side, and ``backs_in_sight`` those
+    among them whose backs may come into sight (see ``asset.sides``); ``texture_bytes``: of their pixels as they are
+    stored here, uncompressed, without mip levels."""
 
     name: str
     files: int
@@ -74,6 +76,8 @@ class Inspection:
     origin: tuple[float, float, float]
     meshes: int
     vertices: int
+    single_sided: int
+    backs_in_sight: int
     counts: Validation
     materials: tuple[MaterialFacts, ...]
     textures: int
@@ -95,6 +99,7 @@ class Inspection:
             f"size        {x} x {y} x {z} m",
             f"triangles   {self.counts.triangles:,} in {_some(self.meshes, 'mesh', 'meshes')}, "
             f"{self.vertices:,} vertices, {_some(self.counts.connected_parts, 'connected part')}",
+            f"sides       {self.single_sided:,} triangles single-sided, {self.backs_in_sight:,} with backs in sight",
             f"textures    {self.textures}, {_bytes(self.texture_bytes)} uncompressed",
         ]
         for what, names in (("skins", self.contents.skins), ("clips", self.contents.clips)):
@@ -123,12 +128,22 @@ def inspect(
     variants: dict[str, str] | None = None,
     missing_textures: MissingTextures = "error",
     root: str | Path | None = None,
+    crease_angle: float | None = None,
 ) -> Inspection:
     """What is in a file, and what is wrong with it. The options are those of ``load``. Raises InputError."""
-    given = load(source, refine=refine, variants=variants, missing_textures=missing_textures, root=root, mend=False)
+    given = load(
+        source,
+        refine=refine,
+        variants=variants,
+        missing_textures=missing_textures,
+        root=root,
+        crease_angle=crease_angle,
+        mend=False,
+    )
     counts, asset = inspected(given, str(source))
     low, high = asset.bounds()
     parts = settled(asset)
+    one_way, backs = sides.counted(tuple(m for m in parts.meshes if not kept_apart(m)))
     textures = _textures({id(m.material): m.material for m in asset.meshes}.values())
     files = [file for file in dict.fromkeys(asset.files) if file.is_file()]
     x, y, z = (float(s) for s in high - low)
@@ -140,6 +155,8 @@ def inspect(
         origin=asset.origin,
         meshes=len(asset.meshes),
         vertices=sum(len(m.positions) for m in asset.meshes),
+        single_sided=one_way,
+        backs_in_sight=backs,
         counts=counts,
         materials=_materials(parts),
         textures=len(textures),
