@@ -143,7 +143,8 @@ def inspect(
     counts, asset = inspected(given, str(source))
     low, high = asset.bounds()
     parts = settled(asset)
-    one_way, backs = sides.counted(tuple(m for m in parts.meshes if not kept_apart(m)))
+    fitted = (m for m, out in zip(parts.meshes, kept_apart(parts), strict=True) if not out)
+    one_way, backs = sides.counted(tuple(fitted))
     textures = _textures({id(m.material): m.material for m in asset.meshes}.values())
     files = [file for file in dict.fromkeys(asset.files) if file.is_file()]
     x, y, z = (float(s) for s in high - low)
