@@ -12,12 +12,17 @@ if TYPE_CHECKING:
     from rich.progress import Progress
 
 
+EVERY = 5.0
+"""Seconds between lines where there is no terminal for a bar."""
+
+
 class TerminalProgress:
-    """Shows step, loss, held-out PSNR, steps per second and time left. A context manager."""
+    """Shows what is being done, and during a fit step, loss, held-out PSNR, steps per second and time left. A context
+    manager."""
 
     def __init__(self) -> None:
         self._bar: Progress | None = None
-        self._last = 0.0
+        self._last = -EVERY
 
     def __enter__(self) -> TerminalProgress:
         if sys.stderr.isatty():
@@ -36,6 +41,13 @@ class TerminalProgress:
         if self._bar is not None:
             self._bar.stop()
 
+    def stage(self, text: str) -> None:
+        """See ``fit.loop.Progress``."""
+        if self._bar is not None:
+            self._bar.update(self._task, description=text, info="")
+        else:
+            self._print(text)
+
     def update(
         self, step: int, fraction: float, loss: float, psnr: float, steps_per_second: float, seconds_left: float | None
     ) -> None:
@@ -44,6 +56,10 @@ class TerminalProgress:
         info = f"step {step}  loss {loss:.5f}  held-out {psnr:.2f} dB  {steps_per_second:.1f} steps/s{left}"
         if self._bar is not None:
             self._bar.update(self._task, description="fitting", completed=fraction, info=info)
-        elif time.monotonic() - self._last > 5:
+        else:
+            self._print(f"{100 * fraction:3.0f} %  {info}")
+
+    def _print(self, line: str) -> None:
+        if time.monotonic() - self._last >= EVERY:
             self._last = time.monotonic()
-            print(f"{100 * fraction:3.0f} %  {info}", file=sys.stderr)
+            print(line, file=sys.stderr, flush=True)

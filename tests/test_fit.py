@@ -268,6 +268,9 @@ def test_more_triangles_than_there_are(ball: Asset) -> None:
 
 def test_interrupt_keeps_the_best_state(ball: Asset) -> None:
     class Stop:
+        def stage(self, text: str) -> None:
+            pass
+
         def update(self, step: int, *_: object) -> None:
             if step == 3:
                 raise KeyboardInterrupt

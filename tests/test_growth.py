@@ -149,6 +149,9 @@ def test_growing_counts_among_the_steps(ball: Asset) -> None:
     seen: list[int] = []
 
     class Steps:
+        def stage(self, text: str) -> None:
+            pass
+
         def update(self, step: int, *rest: object) -> None:
             seen.append(step)
 

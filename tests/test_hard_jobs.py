@@ -201,6 +201,9 @@ def test_an_interrupted_fit_hands_out_what_it_reached(ball: Asset) -> None:
     """Not the last state that was looked at: the one at the interrupt, if it is better."""
 
     class Stop:
+        def stage(self, text: str) -> None:
+            pass
+
         def update(self, step: int, *_: object) -> None:
             if step == 20:
                 raise KeyboardInterrupt

@@ -73,6 +73,9 @@ def test_the_result_survives_two_interrupts(
             interrupt()
 
     class Step:
+        def stage(self, text: str) -> None:
+            pass
+
         def update(self, step: int, *rest: object) -> None:
             if step == 2:
                 when(next(moments))

@@ -112,7 +112,10 @@ class FitResult:
 
 
 class Progress(Protocol):
-    """Called after every step and every look at the held-out views."""
+    """Told of what a job does: ``stage`` when it begins with something that may take long, in a few words, and
+    ``update`` after every step of a fit and every look at the held-out views."""
+
+    def stage(self, text: str) -> None: ...
 
     def update(
         self, step: int, fraction: float, loss: float, psnr: float, steps_per_second: float, seconds_left: float | None

@@ -9,6 +9,8 @@ why it was not enough, is in docs/design.md.
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,6 +21,9 @@ from appearance_opt.initial.edges import Sides, edges_of, keys, touching
 from appearance_opt.initial.flips import flip_edges
 from appearance_opt.initial.parts import drop_cheap_parts, drop_smallest_parts
 from appearance_opt.initial.stacks import without_stacks
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
 
 BOUNDARY_WEIGHT = 1.0
 """Weight of the planes that hold open boundaries in place, relative to a face of the same size."""
@@ -68,6 +73,7 @@ def decimate_with_source(
     triangles: int,
     importance: NDArray | None = None,
     single_sided: NDArray | None = None,
+    told: Callable[[int], None] = lambda _: None,
 ) -> tuple[NDArray[np.float64], NDArray[np.int32], NDArray[np.int64]]:
     """At most ``triangles`` triangles that look like the given ones.
 
@@ -75,7 +81,7 @@ def decimate_with_source(
     attribute seams are no borders. ``importance`` (F,): non-negative weight of each face, 1 by default.
     ``single_sided`` (F,): faces that are seen from their front only; none are by default. Faces that lie on
     others and add nothing to any image go first (see ``stacks``). Parts that would cost more than they show
-    are dropped as a whole.
+    are dropped as a whole. ``told``: called before rounds with the number of triangles that are left.
 
     Returns welded positions, faces, and for each of these one of the given faces that it comes from, which has
     the same sidedness. The count falls short of the budget by one or two at most, unless no legal
@@ -95,6 +101,7 @@ def decimate_with_source(
     for freedom in (STRICT, TURNING):
         state.blocked = state.blocked[:0]
         while len(state.faces) > triangles and (price := _round(state, triangles, freedom)) is not None:
+            told(len(state.faces))
             if len(state.faces) <= EARLY * triangles:
                 drop_cheap_parts(state, triangles, price)
     if len(state.faces) > triangles:

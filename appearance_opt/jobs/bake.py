@@ -83,7 +83,7 @@ def bake(
 
     if options.joint:
         raise InputError("joint bakes have a function of their own, appearance_opt.joint, with another result")
-    watch = Stopwatch(began)
+    watch = Stopwatch(began, progress)
     outputs = Outputs.of(out, options, report=report, textures=textures)
     outputs.check()
     outputs.check_sources(high, low, *inputs)
@@ -104,10 +104,12 @@ def _baked(
     from appearance_opt.jobs.fitting import conclude
     from appearance_opt.jobs.simplify import loaded
 
+    watch.begin("reading both meshes")
     heavy, light = loaded(high, options, variants), loaded_low(low, options)
     outputs.check_inputs(heavy, light)
     outputs.check_room(light.triangle_count, options)
     watch.lap("load")
+    watch.begin(f"preparing {heavy.triangle_count:,} and {light.triangle_count:,} triangles")
     run = BakeJob(*split_pair(high, heavy, low, light), options, watch, interrupts)
     result, error = run.run(progress, outputs.report is not None)
     if outputs.out is not None:
@@ -217,6 +219,7 @@ class BakeJob:
         from appearance_opt.jobs.fitting import fit_start
         from appearance_opt.jobs.start import Start, told
 
+        self.watch.begin("casting rays from texels")
         baked = bake_closed_form(self.reference, self.mesh, self._settings())
         self.check_missed(baked)
         self.watch.lap("closed form")

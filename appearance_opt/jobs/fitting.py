@@ -50,11 +50,18 @@ REPORT_SECONDS = 5.0
 
 
 class Stopwatch:
-    """Seconds by stage. ``began``: ``time.perf_counter()`` of the start, by default now."""
+    """Seconds by stage. ``began``: ``time.perf_counter()`` of the start, by default now. ``progress``: told what
+    begins."""
 
-    def __init__(self, began: float | None = None) -> None:
+    def __init__(self, began: float | None = None, progress: Progress | None = None) -> None:
+        self._progress = progress
         self.began = self._last = time.perf_counter() if began is None else began
         self.stages: dict[str, float] = {}
+
+    def begin(self, text: str) -> None:
+        """Say what begins, in a few words."""
+        if self._progress is not None:
+            self._progress.stage(text)
 
     def lap(self, stage: str) -> None:
         """Everything since the last lap was ``stage``."""
@@ -79,6 +86,7 @@ def conclude(result: Timed, watch: Stopwatch, write_report: Callable[[], None] |
     """Write the report, if there is to be one, and note the time of every stage. The result is written already: a
     Ctrl-C from here on, the imports of the report included, ends the report alone."""
     if write_report is not None:
+        watch.begin("drawing the report")
         result.seconds = dict(watch.stages)
         try:
             write_report()

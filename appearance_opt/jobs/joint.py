@@ -40,7 +40,7 @@ def joint(
     is represented best. ``inputs``: other files that must not be replaced. Raises AppearanceError."""
     from appearance_opt.jobs.fitting import Stopwatch
 
-    watch = Stopwatch(began)
+    watch = Stopwatch(began, progress)
     outputs = Outputs.of(out, options, report=report)
     outputs.check()
     outputs.check_sources(high, low, *inputs)
@@ -62,6 +62,7 @@ def _joined(
     from appearance_opt.jobs.displaced import require_memory
     from appearance_opt.jobs.fitting import conclude
 
+    watch.begin("reading both meshes")
     heavy, light = loaded(high, options, variants), loaded_low(low, options)
     outputs.check_inputs(heavy, light)
     outputs.check_room(light.triangle_count, options)

@@ -89,7 +89,7 @@ def simplify(
     """
     from appearance_opt.jobs.fitting import Stopwatch
 
-    watch = Stopwatch(began)
+    watch = Stopwatch(began, progress)
     outputs = Outputs.of(out, options, report=report, checkpoint=checkpoint)
     outputs.check()
     first = options.init if Path(options.init).suffix else None
@@ -112,6 +112,7 @@ def _simplified(
 ) -> SimplifyResult:
     from appearance_opt.jobs.fitting import conclude
 
+    watch.begin(f"reading {Path(source).name}" if isinstance(source, (str, Path)) else "checking the asset")
     asset = loaded(source, options, variants)
     first = loaded_start(options)
     outputs.check_inputs(asset, first)
@@ -128,6 +129,7 @@ def _simplified(
     run = _Job(parts, first, options, watch, progress, checkpointer, interrupts, outputs.report is not None)
     result = run.fit()
     if outputs.out is not None:
+        watch.begin("writing the result")
         write_result(result, outputs.out, options)
         watch.lap("write")
     interrupts.release()
@@ -205,6 +207,7 @@ class _Job:
             *asset.notes,
             *parts.told("pass into the result as they are, and count for no --triangles or --ratio"),
         ]
+        watch.begin(f"preparing {asset.triangle_count:,} triangles")
         self.frame = framing(asset.points())
         # the fit works on an object of radius 1 around the origin, so that no threshold in it and no
         # digit of a float depends on the scale and place of the input
@@ -219,7 +222,9 @@ class _Job:
         elif options.init in ("decimate", "sphere"):
             triangles = budget(options, asset.triangle_count)
             left = seconds_left(options, watch, with_report)
-            self.start = self._kept(lambda: make_start(self.reference, options, self.sampler, triangles, left))
+            self.start = self._kept(
+                lambda: make_start(self.reference, options, self.sampler, triangles, left, watch.begin)
+            )
         else:
             assert first is not None
             mesh, notes = atlas_of(first, self.frame, asset.triangle_count, options, self.reference.single)

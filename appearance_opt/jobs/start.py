@@ -30,7 +30,7 @@ from appearance_opt.render.material import COLORS, UNLIT
 from appearance_opt.views import START, VISIBILITY
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Callable, Mapping
 
     from numpy.typing import NDArray
 
@@ -112,8 +112,10 @@ def make_start(
     sampler: ViewSampler,
     triangles: int,
     seconds: float | None = None,
+    tell: Callable[[str], None] = lambda _: None,
 ) -> Start:
-    """Sphere, or decimated reference. ``seconds``: what is left for start and fit (None: no limit)."""
+    """Sphere, or decimated reference. ``seconds``: what is left for start and fit (None: no limit). ``tell``: called
+    with what begins, in a few words."""
     size = options.texture_size
     if options.init == "sphere":
         if triangles < SMALLEST_SPHERE:
@@ -124,7 +126,7 @@ def make_start(
         if options.displaced:
             return Start(mesh, {**maps, DISPLACEMENT: flat_map(mesh, options)}, False, known, options.levels())
         return Start(mesh, {**maps}, False, known)
-    starts = _Decimated(reference, options, sampler, triangles)
+    starts = _Decimated(reference, options, sampler, triangles, tell)
     began = time.perf_counter()
     start = starts.weighted(starts.weight)
     taken = time.perf_counter() - began
@@ -166,8 +168,14 @@ class _Decimated:
     faces: NDArray
 
     def __init__(
-        self, reference: MeshReference, options: SimplifyOptions, sampler: ViewSampler, triangles: int
+        self,
+        reference: MeshReference,
+        options: SimplifyOptions,
+        sampler: ViewSampler,
+        triangles: int,
+        tell: Callable[[str], None],
     ) -> None:
+        self.tell = tell
         self.reference, self.options, self.triangles = reference, options, triangles
         self.views = sampler.held_out(START)
         merged, scene = reference.merged, reference.scene
@@ -175,12 +183,14 @@ class _Decimated:
         clusters = max(CLUSTERS * triangles, LEAST_CLUSTERS)
         self.coarse = is_coarse(len(merged.faces), len(merged.positions), clusters, options.budget)
         if self.coarse:
+            tell("clustering vertices")
             self.positions, self.faces, source = clustered(merged.positions, merged.faces, clusters)
             self.single = reference.single[source]
             scene = upload.scene_of(self.positions, self.faces, culled(self.positions, self.faces, self.single))
         count = len(self.faces)
         self.weight, self.visible = np.ones(count), np.ones(count, bool)
         if not options.keep_hidden:
+            tell("looking for what can be seen")
             pixels = pixel_counts(scene, count, sampler.held_out(VISIBILITY), VISIBILITY_VIEWS)
             self.weight, seen = importance(self.positions, self.faces, pixels)
             self.visible = seen if seen.sum() >= triangles else self.visible
@@ -189,10 +199,16 @@ class _Decimated:
         """The reference decimated with these importances of its faces (F,)."""
         single = self.single[self.visible]
         positions, faces, source = decimate_with_source(
-            self.positions, self.faces[self.visible], self.triangles, weight[self.visible], single
+            self.positions,
+            self.faces[self.visible],
+            self.triangles,
+            weight[self.visible],
+            single,
+            told=lambda left: self.tell(f"decimating: {left:,} triangles left"),
         )
         if not len(faces):
             raise InputError("nothing is left of this mesh at that budget; ask for more triangles")
+        self.tell(f"unwrapping {len(faces):,} triangles")
         return self._mapped(charted(positions, faces, single[source]), np.ones(len(faces)), False)
 
     def moved(self, start: Start, judge: StartError, rounds: int) -> tuple[Start, float]:
@@ -219,6 +235,7 @@ class _Decimated:
 
     def _mapped(self, charts: LatentMesh, scale: NDArray, tight: bool) -> Start:
         options = self.options
+        self.tell("packing the atlas and baking its maps")
         mesh = packed(charts, scale, options.texture_size, gutter(len(charts.faces), options), tight)
         return replace(transferred(self.reference, mesh, options), charts=charts)
 
