@@ -57,6 +57,6 @@ def split(asset: Asset, name: str, job: str, by_light: bool = True) -> Parts:
     if not fitted:
         raise InputError(
             f"{name}: all of it is transparent ({listed(m.material.name for m in kept)}), and transparent parts are "
-            f"kept as they are: there is nothing to {job}"
+            f"kept as they are: there is nothing to {job}; materials that shall count as opaque must say so"
         )
     return Parts(replace(asset, meshes=fitted) if kept else asset, kept)
