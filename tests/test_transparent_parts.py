@@ -13,6 +13,7 @@ from appearance_opt.asset import load, save
 from appearance_opt.asset.alpha import kind_of, seen_through
 from appearance_opt.asset.types import Asset, Material, Mesh, Texture
 from appearance_opt.errors import InputError
+from appearance_opt.interrupts import Interrupts
 from appearance_opt.jobs import report
 from appearance_opt.jobs.bake import BakeJob
 from appearance_opt.jobs.fitting import Stopwatch
@@ -152,7 +153,7 @@ def test_what_is_aligned_is_aligned_whole(snow_globe: Asset) -> None:
     )
     low = Asset((ball(0.5, Material("low", BLUE), "low", 16),), "low")
     parts = split(moved, "HIGH", "bake"), split(low, "LOW", "bake onto")
-    job = BakeJob(*parts, "LOW", appearance_opt.bake_options(align=True, unwrap=True), Stopwatch())
+    job = BakeJob(*parts, "LOW", appearance_opt.bake_options(align=True, unwrap=True), Stopwatch(), Interrupts())
     for mesh, name in zip(job.high.meshes, ("ball", "shell", "sticker"), strict=True):
         expected = next(m for m in snow_globe.meshes if m.name == name)
         np.testing.assert_allclose(mesh.positions, expected.positions, atol=2e-3)
