@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from appearance_opt.asset.sides import culled
+from appearance_opt.asset.sides import counted, culled
+from appearance_opt.asset.types import Material, Mesh
 from appearance_opt.baking.occlusion import exposed
 from appearance_opt.initial.sphere import sphere
 from appearance_opt.render import raster, rays, upload
@@ -69,6 +70,19 @@ def test_only_backs_that_can_be_seen_need_anything() -> None:
     both = joined((p, f), sheet(), (sheet()[0], sheet()[1][:, ::-1]))
     found = culled(*both, np.ones(len(both[1]), bool))
     np.testing.assert_array_equal(found, np.arange(len(both[1])) >= len(f))
+
+
+def test_backs_in_sight_are_counted() -> None:
+    def mesh(p: NDArray, f: NDArray, double_sided: bool) -> Mesh:
+        return Mesh(p, f.astype(np.int32), material=Material(double_sided=double_sided))
+
+    p, f = ball()
+    closed, open_, both = mesh(p, f, False), mesh(p, f[1:], False), mesh(p, f, True)
+    apart = mesh(p + np.float32(3), f[1:], False)
+    assert counted(()) == counted((both,)) == (0, 0)
+    assert counted((closed,)) == (len(f), 0)
+    assert counted((closed, apart)) == (2 * len(f) - 1, len(f) - 1)
+    assert counted((open_, both)) == (len(f) - 1, len(f) - 1)
 
 
 def test_two_triangles_back_to_back_are_no_solid() -> None:

@@ -14,11 +14,13 @@ from test_sides import ball, sheet
 from appearance_opt import simplify, simplify_options
 from appearance_opt.asset import load, save
 from appearance_opt.asset.types import Asset, Material, Mesh, Texture
+from appearance_opt.baking.low import movable
 from appearance_opt.initial.atlas import charted, charts_of, unwrap
 from appearance_opt.initial.decimate import decimate_with_source
 from appearance_opt.initial.sheets import separated
 from appearance_opt.jobs.compare import compare
 from appearance_opt.latent.export import to_asset
+from appearance_opt.latent.latent import LatentMesh
 from appearance_opt.latent.subdivision import tessellate
 
 ONE_SIDED = Material(double_sided=False, roughness=0.8)
@@ -93,6 +95,21 @@ def test_sides_of_a_sheet_share_neither_vertices_nor_charts() -> None:
     chart = charts_of(mesh)
     assert not np.intersect1d(chart[front], chart[~front]).size
     np.testing.assert_array_equal(mesh.positions[mesh.faces], p[faces].astype(np.float32))
+    np.testing.assert_array_equal(mesh.frame_vertex[mesh.frame_faces], mesh.faces)
+
+
+@pytest.mark.parametrize("shared", [False, True])
+def test_meshes_that_are_baked_onto_keep_their_sides_apart(shared: bool) -> None:
+    p, f = sheet()
+    faces = np.concatenate([f, f[:, ::-1] if shared else f[:, ::-1] + len(p)]).astype(np.int32)
+    p = p if shared else np.concatenate([p, p])
+    vertices = np.arange(len(p), dtype=np.int32)
+    uvs = np.zeros((len(p), 2), np.float32)
+    low = LatentMesh(p, faces, vertices, faces, uvs, single=np.ones(len(faces), bool))
+    mesh = movable(low)
+    front = np.arange(len(faces)) < len(f)
+    assert bool(np.intersect1d(mesh.faces[front], mesh.faces[~front]).size) == shared
+    np.testing.assert_array_equal(mesh.positions[mesh.faces], p[faces])
     np.testing.assert_array_equal(mesh.frame_vertex[mesh.frame_faces], mesh.faces)
 
 

@@ -25,14 +25,13 @@ as thick as it is wide. A ball has 0.094."""
 
 def single_sided(meshes: tuple[Mesh, ...]) -> NDArray[np.bool_]:
     """(F,) faces of all meshes, one mesh after the other, that are seen from their front only."""
-    return np.repeat([not m.material.double_sided for m in meshes], [len(m.faces) for m in meshes])
+    one_way = np.array([not m.material.double_sided for m in meshes], bool)
+    return np.repeat(one_way, np.array([len(m.faces) for m in meshes], np.int64))
 
 
 def counted(meshes: tuple[Mesh, ...]) -> tuple[int, int]:
     """(single-sided faces, those among them whose backs may come into sight: see ``culled``)."""
     single, batch = single_sided(meshes), Batch(meshes)
-    if not single.any():
-        return 0, 0
     in_sight = culled(batch.joined("positions"), batch.faces, single)
     return int(single.sum()), 0 if in_sight is None else int(in_sight.sum())
 

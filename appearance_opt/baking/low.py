@@ -11,6 +11,7 @@ from appearance_opt.asset.normals import vertex_normals, weld
 from appearance_opt.asset.sides import single_sided
 from appearance_opt.asset.tangents import split_and_tangents
 from appearance_opt.asset.types import Asset, Material
+from appearance_opt.initial.sheets import separated
 from appearance_opt.latent.latent import LatentMesh
 
 if TYPE_CHECKING:
@@ -62,12 +63,19 @@ def moved(mesh: LatentMesh, centre: NDArray, scale: float) -> LatentMesh:
 
 def movable(mesh: LatentMesh) -> LatentMesh:
     """The mesh with its vertices joined wherever they lie at the same place, so that its shape can be fitted and
-    no seam opens. Faces and texture coordinates stay; normals follow from the shape from now on."""
+    no seam opens; those of sheets back to back are not, unless the mesh itself joins them. Faces and texture
+    coordinates stay; normals follow from the shape from now on."""
     first, place = weld(mesh.positions)
+    welded = place[mesh.faces].astype(np.int32)
+    sheets = separated(mesh.positions[first], welded, mesh.single)
+    positions, faces, vertex = sheets.positions, sheets.faces, place[mesh.frame_vertex].astype(np.int32)
+    vertex[mesh.frame_faces] = faces
+    if not np.array_equal(vertex[mesh.frame_faces], faces):
+        positions, faces, vertex = mesh.positions[first], welded, place[mesh.frame_vertex].astype(np.int32)
     return LatentMesh(
-        positions=mesh.positions[first],
-        faces=place[mesh.faces].astype(np.int32),
-        frame_vertex=place[mesh.frame_vertex].astype(np.int32),
+        positions=positions,
+        faces=faces,
+        frame_vertex=vertex,
         frame_faces=mesh.frame_faces,
         uvs=mesh.uvs,
         single=mesh.single,
