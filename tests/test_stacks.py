@@ -7,6 +7,7 @@ import pytest
 
 from appearance_opt.initial.decimate import decimate, decimate_with_source
 from appearance_opt.initial.stacks import without_stacks
+from appearance_opt.initial.visibility import importance
 
 
 def plate(n: int) -> tuple[np.ndarray, np.ndarray]:
@@ -163,3 +164,15 @@ def test_two_sides_of_a_sheet_collapse_together() -> None:
     assert normal[normal < 0].sum() == pytest.approx(-1.0, abs=0.01)
     # each face comes from one of its own side
     np.testing.assert_array_equal(source < len(f), normal > 0)
+
+
+def test_copies_share_their_pixels_and_count_as_one() -> None:
+    """Which of two coincident faces a ray finds is chance; what both are worth is not."""
+    p, f = plate(6)
+    rng = np.random.default_rng(0)
+    counts = rng.integers(100, 200, len(f))
+    alone, _ = importance(p, f, counts)
+    first = rng.integers(0, 100, len(f))
+    twice, visible = importance(p, np.concatenate([f, f[:, [1, 2, 0]]]), np.concatenate([first, counts - first]))
+    np.testing.assert_allclose(twice, np.concatenate([alone, alone]), rtol=5e-3)
+    assert visible.all()

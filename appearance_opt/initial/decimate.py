@@ -145,14 +145,16 @@ def _add_boundaries(
 ) -> None:
     """Planes through the edges whose faces all have the same corners (one face, or the two sides of a sheet), and
     through those between faces that are seen from one side and from both."""
-    start, end, opposite = sides.corners(faces)
+    opposite = faces[:, [2, 0, 1]].ravel()[3 * sides.face + sides.corner]
     alone = np.minimum.reduceat(opposite, sides.start) == np.maximum.reduceat(opposite, sides.start)
-    one_way = single_sided[sides.face]
-    alone |= np.logical_and.reduceat(one_way, sides.start) != np.logical_or.reduceat(one_way, sides.start)
-    open_ = np.flatnonzero(np.repeat(alone, sides.uses))
-    if not len(open_):
+    if single_sided.any():
+        one_way = single_sided[sides.face]
+        alone |= np.logical_and.reduceat(one_way, sides.start) != np.logical_or.reduceat(one_way, sides.start)
+    if not alone.any():
         return
-    a, b, face = start[open_], end[open_], sides.face[open_]
+    open_ = np.flatnonzero(np.repeat(alone, sides.uses))
+    face, corner = sides.face[open_], sides.corner[open_]
+    a, b = faces[face, corner], faces[face, (corner + 1) % 3]
     edge = positions[b] - positions[a]
     weight = BOUNDARY_WEIGHT * np.sum(edge**2, axis=1) * importance[face] / 2
     q = quadrics.of_planes(unit(np.cross(edge, normals[face])), positions[a], weight)

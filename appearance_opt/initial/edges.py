@@ -28,7 +28,8 @@ class Sides:
 
     def corners(self, faces: NDArray) -> tuple[NDArray, NDArray, NDArray]:
         """(first, last, opposite) vertex of each side."""
-        return tuple(faces[self.face, (self.corner + k) % 3] for k in range(3))  # type: ignore[return-value]
+        side = 3 * self.face + self.corner
+        return faces.ravel()[side], faces[:, [1, 2, 0]].ravel()[side], faces[:, [2, 0, 1]].ravel()[side]
 
 
 def sides_of(faces: NDArray) -> Sides:

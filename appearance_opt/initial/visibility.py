@@ -9,6 +9,7 @@ import mitsuba as mi
 import numpy as np
 
 from appearance_opt.asset.normals import weld
+from appearance_opt.initial.stacks import coincident
 from appearance_opt.render import rays
 from appearance_opt.render.deferred import Grid
 
@@ -60,11 +61,15 @@ def importance(positions: NDArray, faces: NDArray, counts: NDArray) -> tuple[NDA
 
 
 def welded_areas(positions: NDArray, faces: NDArray) -> tuple[NDArray, NDArray[np.float64], int]:
-    """(faces over welded vertices (F, 3), their areas (F,), number of welded vertices)."""
+    """(faces over welded vertices (F, 3), their areas (F,), number of welded vertices). Faces that coincide share the
+    area of their place, as they share the pixels that show it."""
     first, place = weld(np.asarray(positions))
     f = place[faces]
     p = np.asarray(positions, np.float64)[first]
     area = 0.5 * np.linalg.norm(np.cross(p[f[:, 1]] - p[f[:, 0]], p[f[:, 2]] - p[f[:, 0]]), axis=1)
+    copies, of_place = coincident(f)
+    if len(copies):
+        area[copies] /= np.bincount(of_place)[of_place]
     return f, area, len(p)
 
 
