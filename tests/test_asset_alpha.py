@@ -181,6 +181,6 @@ def test_inspect_says_what_becomes_of_each(tmp_path: Path, capsys: pytest.Captur
     save(Asset((*cards, card(LEAF, RIGHT))), tmp_path / "x.glb")
     inspect(tmp_path / "x.glb")
     lines = [" ".join(line.split()) for line in capsys.readouterr().out.splitlines()]
-    assert "opaque 4 triangles: fitted" in lines
-    assert "mask 2 triangles: kept as it is" in lines
-    assert "blend 4 triangles: kept as it is" in lines
+    assert "opaque 2 meshes, 4 triangles: fitted" in lines
+    assert "mask 1 mesh, 2 triangles: kept as it is" in lines
+    assert "blend 2 meshes, 4 triangles: kept as it is" in lines

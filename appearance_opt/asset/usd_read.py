@@ -118,7 +118,7 @@ def _refuse_escapes(stage: Any, path: Path, companions: Companions) -> None:
             check_inside(file, path, layer.identifier, companions.root)
         except InputError:
             raise InputError(
-                f"{path}: refers to '{layer.identifier}' and files in other folders than its own; allow the folder: "
+                f"{path}: refers to '{layer.identifier}' outside its own folder; allow the folder of all it needs: "
                 f"--root {_folder_of_all(stage, path, companions.root)}"
             ) from None
         companions.files.append(file.resolve())

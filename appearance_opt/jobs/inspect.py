@@ -111,7 +111,10 @@ class Inspection:
         out.append(f"to look at  {'' if faults else 'nothing'}".rstrip())
         out += [f"  {name.replace('_', ' '):24}{count:,}" for name, count in faults.items()]
         out.append("simplify")
-        out += [f"  {kind:24}{s.triangles:,} triangles: {s.becomes}" for kind, s in self.alpha.items()]
+        out += [
+            f"  {kind:24}{_some(s.meshes, 'mesh', 'meshes')}, {s.triangles:,} triangles: {s.becomes}"
+            for kind, s in self.alpha.items()
+        ]
         out.append(f"materials   {len(self.materials):,}")
         for material in self.materials[:LISTED]:
             out += _material_lines(material)
