@@ -332,7 +332,7 @@ DOCUMENT = """<?xml version="1.0"?>
     <output name="color" type="color3" nodename="m" />
   </nodegraph>
   <open_pbr_surface name="S" type="surfaceshader">
-    <input name="base_color" type="color3" nodegraph="G" output="color" />
+    {color}
     <input name="base_metalness" type="float" value="1" />
     {inputs}
   </open_pbr_surface>
@@ -343,9 +343,12 @@ DOCUMENT = """<?xml version="1.0"?>
 """
 
 
-def document(folder: Path, inputs: str = "", space: str = "", more: str = "") -> Asset:
+GRAPH = '<input name="base_color" type="color3" nodegraph="G" output="color" />'
+
+
+def document(folder: Path, inputs: str = "", space: str = "", more: str = "", color: str = GRAPH) -> Asset:
     """A quad that wears the material of a document, which usd-core cannot compose."""
-    (folder / "x.mtlx").write_text(DOCUMENT.format(inputs=inputs, space=space, more=more))
+    (folder / "x.mtlx").write_text(DOCUMENT.format(inputs=inputs, space=space, more=more, color=color))
     stage = STAGE.format(output="", shaders="").replace('def Material "M"', 'def "Look" (references = @x.mtlx@)')
     (folder / "x.usda").write_text(stage)
     return load(folder / "x.usda")
@@ -358,6 +361,18 @@ def test_a_document_with_a_node_graph(tmp_path: Path) -> None:
     np.testing.assert_array_equal(material.base_color_texture.pixels, color)
     assert material.base_color == pytest.approx((0.5, 0.25, 1))
     assert (material.metalness, material.roughness) == (1, pytest.approx(0.3))
+
+
+def test_tile_sizes_have_units(tmp_path: Path) -> None:
+    picture(tmp_path / "c.png")
+    more = """<tiledimage name="t" type="color3">
+      <input name="file" type="filename" value="c.png" />
+      <input name="realworldimagesize" type="vector2" value="0.5 0.25" unit="foot" unittype="distance" />
+      <input name="realworldtilesize" type="vector2" value="1, 1" unit="inch" unittype="distance" />
+    </tiledimage>"""
+    color = '<input name="base_color" type="color3" nodename="t" />'
+    uvs = np.asarray(document(tmp_path, more=more, color=color).meshes[0].uvs)
+    np.testing.assert_allclose(np.ptp(uvs, axis=0), (1 / 6, 1 / 3), atol=1e-6)
 
 
 def test_colours_of_a_document_are_in_its_colour_space(tmp_path: Path) -> None:

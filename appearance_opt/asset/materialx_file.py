@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -21,6 +22,12 @@ if TYPE_CHECKING:
 
     from appearance_opt.asset.companions import Companions
     from appearance_opt.asset.types import ColorSpace, Texture
+
+_METRES = {
+    "nanometer": 1e-9, "micron": 1e-6, "millimeter": 1e-3, "centimeter": 1e-2, "inch": 0.0254, "foot": 0.3048,
+    "yard": 0.9144, "meter": 1.0, "kilometer": 1e3, "mile": 1609.344,
+}  # fmt: skip
+"""Units of lengths, of which only ratios count here."""
 
 MAX_INCLUDES = 16
 """Documents that include each other, in a row."""
@@ -129,7 +136,8 @@ def _constant(source: Any) -> Input | None:
     if kind == "boolean":
         return Input((float(text == "true"),))
     try:
-        numbers = tuple(float(x) for x in text.split(","))
+        scale = _METRES.get(source.getUnit(), 1.0)
+        numbers = tuple(scale * float(x) for x in re.split(r"[,\s]+", text.strip()))
     except ValueError:
         return None
     if kind.startswith("color") and _space(source) == "srgb":
