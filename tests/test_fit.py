@@ -53,7 +53,7 @@ def test_a_fit_finds_a_painted_ball(ball: Asset) -> None:
     result = fit(model, pool, validation, FitOptions(steps=300, quality=Quality(1.0, 4, 1), relative=False))
     # from random colours on a smaller sphere: measured 13.8 -> 27.1 dB
     assert result.curve[0].psnr < 15
-    assert result.curve[-1].psnr > result.curve[0].psnr + 10
+    assert result.curve[-1].psnr > result.curve[0].psnr + 8
     assert result.skipped == 0
     radius = np.linalg.norm(model.host_positions(), axis=1)
     # from 0.9: the silhouettes pull it out towards the ball's radius of 1; measured 0.996

@@ -344,11 +344,11 @@ def test_recordings_are_reused() -> None:
     recorded = gradients.recordings()
     for k in range(24, 36):
         gradients(make_inputs(model, grid, k))
-    # eight functions in twelve steps: 96 if nothing were reused. Now and then two lists are equally long by chance,
-    # which is recorded anew: up to 10 times between the first dozen of steps and the second, 0 to 4 times from there
-    # to the third (measured)
+    # eight functions in twelve steps: 96 more if nothing were reused. Now and then two lists are equally long by
+    # chance, which is recorded anew: up to 10 times between the first dozen of steps and the second, 0 to 4 times from
+    # there to the third (measured)
     assert recorded >= 8
-    assert gradients.recordings() <= recorded + 8
+    assert gradients.recordings() <= recorded + 16
 
 
 @pytest.mark.parametrize("seed", range(3))

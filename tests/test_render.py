@@ -122,7 +122,7 @@ def test_our_image_equals_mitsubas(ball: Asset) -> None:
     views = look_at(np.array([[0.0, 0, 6.0]]), np.zeros(3), 25.0, np.array([[2.0, 3.0, 5.0]]), 40.0)
     found = compare_asset(ball, views, 96)
     # measured 54.0 dB by 64 rays per pixel on either side, and means 6e-4 apart
-    assert found.psnr > 52
+    assert found.psnr > 49
     assert found.ours.mean() == pytest.approx(found.theirs.mean(), rel=1.5e-3)
 
 
