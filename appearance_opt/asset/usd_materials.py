@@ -17,8 +17,8 @@ from appearance_opt.asset.paths import check_inside
 from appearance_opt.asset.specular_glossiness import Specular
 from appearance_opt.asset.types import Material, Mesh, Texture
 from appearance_opt.asset.usd_networks import UsdNode
+from appearance_opt.asset.usd_package import read_packaged
 from appearance_opt.asset.uv_frames import Place
-from appearance_opt.errors import MissingFileError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
@@ -386,13 +386,8 @@ class MaterialReader:
     def _image(self, text: str) -> NDArray:
         if text not in self._pixels:
             if "[" in text:  # inside a .usdz package
-                from pxr import Ar
-
                 check_inside(Path(text.split("[")[0]), self.path, text, self.companions.root)
-                opened = Ar.GetResolver().OpenAsset(Ar.ResolvedPath(text))
-                if not opened:
-                    raise MissingFileError(f"{self.path}: refers to '{text}', which does not exist")
-                self._pixels[text] = self.companions.decoded(bytes(opened.GetBuffer()), text)
+                self._pixels[text] = self.companions.decoded(read_packaged(text, self.path), text)
             else:
                 self._pixels[text] = self.companions.picture(self.companions.find(text, self.path))
         return self._pixels[text]
