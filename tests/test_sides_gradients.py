@@ -88,12 +88,10 @@ def test_silhouettes_carry_the_derivative_of_the_area_that_is_seen_of_fronts(
     assert error < 0.03
 
 
-@pytest.mark.parametrize("visibility", ["edges", "pairs"])
-def test_frozen_steps_see_backs_turn(visibility: str) -> None:
+def test_frozen_steps_see_backs_turn() -> None:
     """Recorded kernels see sheets that move and turn over."""
     mesh = back_to_back()
     model, grid, quality = Model(mesh, flat_maps(16), frozenset(("shape",)), Rates()), Grid(2, 32), Quality()
-    quality = replace(quality, visibility=visibility)
     frozen, plain = (Gradients(model, grid, quality, LOSSES["l2"], freeze=f) for f in (True, False))
     start = np.array(model.positions()).reshape(-1, 3)
     for k in range(5):
