@@ -6,12 +6,22 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import drjit as dr
+import hypothesis
 import numpy as np
 import pytest
 
 from appearance_opt import backend
 from appearance_opt.asset.types import Asset, Material, Mesh, Texture
 from tests import looks
+
+# the same examples everywhere, however long they take on a busy machine
+hypothesis.settings.register_profile(
+    "anywhere",
+    derandomize=True,
+    deadline=None,
+    suppress_health_check=[hypothesis.HealthCheck.too_slow, hypothesis.HealthCheck.function_scoped_fixture],
+)
+hypothesis.settings.load_profile("anywhere")
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

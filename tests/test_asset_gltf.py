@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from appearance_opt.asset import load, save
@@ -61,7 +61,7 @@ def test_round_trip_is_exact(tmp_path: Path, ball: Asset, suffix: str) -> None:
     assert np.array_equal(used[again.faces], mesh.faces)
 
 
-@settings(max_examples=25, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=25)
 @given(count=st.integers(1, 40), seed=st.integers(0, 2**31))
 def test_round_trip_of_random_triangles(tmp_path: Path, count: int, seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -75,9 +75,7 @@ def test_round_trip_of_random_triangles(tmp_path: Path, count: int, seed: int) -
     assert again.material.base_color == pytest.approx((0.2, 0.4, 0.6))
 
 
-@settings(
-    max_examples=120, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture]
-)
+@settings(max_examples=120)
 @given(cut=st.integers(0, 2000), flips=st.lists(st.tuples(st.integers(0, 5000), st.integers(1, 255)), max_size=4))
 def test_damaged_files_are_refused_or_read(tmp_path: Path, cut: int, flips: list[tuple[int, int]]) -> None:
     document, binary = triangle_document()

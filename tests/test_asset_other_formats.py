@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from appearance_opt.asset import images, load, save
@@ -67,7 +67,7 @@ def test_unusable_obj_files_say_why(tmp_path: Path, text: str, words: str) -> No
         load(folder / "x.obj")
 
 
-@settings(max_examples=80, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=80)
 @given(at=st.integers(0, len(OBJ) - 1), byte=st.integers(0, 255), cut=st.integers(0, len(OBJ)))
 def test_damaged_obj_is_refused_or_read(tmp_path: Path, at: int, byte: int, cut: int) -> None:
     data = bytearray(OBJ.encode())

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from appearance_opt.asset import images, load, save
@@ -69,7 +69,7 @@ damages = st.one_of(
 
 
 @pytest.mark.parametrize("name", ROOTS)
-@settings(max_examples=40, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=40)
 @given(damage=damages)
 def test_damage_to_any_file_is_refused_or_harmless(whole: Path, name: str, damage: tuple) -> None:
     original = (whole / name).read_bytes()
@@ -87,7 +87,7 @@ def test_damage_to_any_file_is_refused_or_harmless(whole: Path, name: str, damag
         (whole / name).write_bytes(original)
 
 
-@settings(max_examples=80, deadline=None, derandomize=True)
+@settings(max_examples=80)
 @given(damage=damages, kind=st.sampled_from(["png8", "png16"]))
 def test_damaged_pictures(damage: tuple, kind: str) -> None:
     rng = np.random.default_rng(0)

@@ -35,7 +35,7 @@ def test_convex_polygons_become_fans() -> None:
     np.testing.assert_array_equal(face, [0, 0, 1])
 
 
-@settings(max_examples=60, deadline=None, derandomize=True)
+@settings(max_examples=60)
 @given(corners=st.integers(4, 12), seed=st.integers(0, 2**16), first=st.integers(0, 11), backward=st.booleans())
 def test_star_shaped_polygons_are_covered_once(corners: int, seed: int, first: int, backward: bool) -> None:
     """Around a point that sees all of them, radii that differ by a factor of ten: mostly not convex."""
