@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import shutil
@@ -91,8 +92,10 @@ class Publication:
         for staged in self._staged.values():
             staged.close()
 
-    def final_name(self, path: str) -> str | None:
-        """The final name of a file that waits here; None if it does not."""
+    def named(self, path: object) -> str | None:
+        """The final name of a file that waits here, the first of all where none is named; None for other files."""
+        if not isinstance(path, str):
+            return str(self._roots[0]) if self._roots else None
         for staged in self._staged.values():
             if Path(path).is_relative_to(staged.root):
                 relative = Path(path).relative_to(staged.root)
@@ -109,10 +112,10 @@ def publication() -> Iterator[Publication]:
         yield together
         together.commit()
     except OSError as error:
-        final = together.final_name(error.filename) if isinstance(error.filename, str) else None
+        final = together.named(error.filename)
         if final is None:
             raise
-        raise OSError(error.errno, error.strerror, final) from error
+        raise OSError(error.errno or errno.EIO, error.strerror or str(error), final) from error
     finally:
         together.close()
 

@@ -13,6 +13,7 @@ import pytest
 from appearance_opt import backend
 from appearance_opt.asset.types import Asset, Material, Mesh, Texture
 from tests import looks
+from tests.inputs import watch_jobs
 
 # the same examples everywhere, however long they take on a busy machine
 hypothesis.settings.register_profile(
@@ -52,6 +53,12 @@ def one_thread(variant: str) -> Iterator[float]:
         dr.set_thread_count(1)
     yield 0.0 if variant == backend.CPU else 2e-2
     dr.set_thread_count(before)
+
+
+@pytest.fixture(autouse=True)
+def inputs_stay(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No job of any test changes its inputs."""
+    watch_jobs(monkeypatch)
 
 
 @pytest.fixture(scope="session")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
@@ -14,18 +15,21 @@ from appearance_opt import backend, config
 from appearance_opt.asset import save
 from appearance_opt.asset.types import Asset
 from appearance_opt.errors import InputError
+from tests.inputs import unchanged
 from tests.looks import COMMAND, ENVIRONMENT
 
 
 def run(
     *arguments: str, cwd: Path | None = None, small: bool = False, **environment: str
 ) -> subprocess.CompletedProcess[str]:
-    """``small``: with the small looks of ``tests.looks``."""
+    """``small``: with the small looks of ``tests.looks``. Files in ``cwd`` stay what they are, but for the result."""
     start = ["-c", COMMAND] if small else ["-m", "appearance_opt"]
-    return subprocess.run(
-        [sys.executable, *start, *arguments],
-        capture_output=True, text=True, cwd=cwd, env={**ENVIRONMENT, **environment},
-    )  # fmt: skip
+    written = [Path(arguments[k + 1]).stem + "*" for k, a in enumerate(arguments[:-1]) if a == "--out"]
+    with nullcontext() if cwd is None else unchanged(cwd, *written):
+        return subprocess.run(
+            [sys.executable, *start, *arguments],
+            capture_output=True, text=True, cwd=cwd, env={**ENVIRONMENT, **environment},
+        )  # fmt: skip
 
 
 def test_simplify_and_compare_as_a_user_would(ball: Asset, tmp_path: Path) -> None:

@@ -185,3 +185,24 @@ def test_loose_maps_and_result_appear_together(tmp_path: Path, monkeypatch: pyte
     with pytest.raises(OSError, match="No space"):
         appearance_opt.bake(heavy, heavy, tmp_path / "x.gltf", options, textures=tmp_path / "maps")
     assert not list(tmp_path.iterdir())
+
+
+def test_jobs_that_change_an_input_would_be_noticed(
+    ball: Asset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The watch of every test, on a job with a planted fault."""
+    from appearance_opt.jobs import simplify as job
+
+    save(ball, tmp_path / "a.glb")
+    (tmp_path / "beside.txt").write_text("kept")
+    write = job.write
+    for name in ("a.glb", "beside.txt"):
+
+        def faulty(asset: Asset, path: Path, name: str = name) -> None:
+            write(asset, path)
+            (tmp_path / name).write_bytes((tmp_path / name).read_bytes() + b"x")
+
+        monkeypatch.setattr(job, "write", faulty)
+        with pytest.raises(AssertionError, match="has changed its input"):
+            appearance_opt.simplify(tmp_path / "a.glb", tmp_path / "b.glb", quick(triangles=50))
+        save(ball, tmp_path / "a.glb")

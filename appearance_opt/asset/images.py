@@ -13,7 +13,7 @@ import numpy as np
 
 from appearance_opt.asset import basis
 from appearance_opt.asset.paths import read_bytes
-from appearance_opt.errors import InputError
+from appearance_opt.errors import InputError, one_line
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -166,9 +166,9 @@ def _encode(pixels: NDArray, spec, suffix: str, attributes: Mapping[str, float |
         path = Path(folder) / ("image" + suffix)
         out = oiio.ImageOutput.create(str(path))
         if out is None or not out.open(str(path), spec) or not out.write_image(pixels):
-            raise OSError(f"cannot encode a {suffix} image: {oiio.geterror()}")
+            raise OSError(f"a {suffix} image could not be encoded in {folder} ({one_line(oiio.geterror())})")
         if not out.close():  # what is buffered meets a full disk only now
-            raise OSError(f"cannot encode a {suffix} image: {out.geterror()}")
+            raise OSError(f"a {suffix} image could not be encoded in {folder} ({one_line(out.geterror())})")
         return path.read_bytes()
 
 

@@ -5,7 +5,7 @@
 ``kills``: SIGKILL at random moments of a run over an older result, then the same command with --resume. ``interrupts``:
 SIGINT and SIGTERM, half of each. ``deaths``: killed at each call that changes the disk. ``full``: no room left from
 each such call on. After each, no file under a final name may be half written, or of another version than the file that
-refers to it, and inputs are as they were. Rows go to ``out/robustness/results.json`` and are printed. Needs nothing
+refers to it, and inputs are as they were. Rows go to ``out/robustness/results_*.json`` and are printed. Needs nothing
 but a C compiler; kills are shared out among the suffixes.
 """
 
@@ -21,9 +21,12 @@ import numpy as np
 from appearance_opt.publish import recover
 from experiments.common import OUT
 from experiments.robustness import runs
-from experiments.robustness.runs import NEW, Case
+from experiments.robustness.runs import Case
 
 FOLDER = OUT / "robustness"
+
+STEPS = {"kills": 12, "interrupts": 12, "deaths": 2, "full": 2}
+"""Of the fit, after each of which a checkpoint is written."""
 
 
 @dataclass
@@ -50,7 +53,7 @@ class Row:
 
     def resumed(self, case: Case) -> None:
         """The same command with --resume ends as if nothing had happened."""
-        ended = runs.run(case.folder, *case.out, *NEW, "--resume")
+        ended = runs.run(case.folder, *case.command, "--resume")
         if ended.code != 0:
             self.faults.append(f"not resumed: {ended.text[-300:]}")
             return
@@ -64,7 +67,7 @@ def kills(case: Case, count: int, seed: int) -> Row:
     row = Row("kills", case.suffix)
     for moment in np.random.default_rng(seed).random(count):
         case.reset()
-        ended = runs.run(case.folder, *case.out, *NEW, before=runs.after(moment * case.whole.seconds, signal.SIGKILL))
+        ended = runs.run(case.folder, *case.command, before=runs.after(moment * case.whole.seconds, signal.SIGKILL))
         row.ended(ended)
         row.cut += ended.code < 0
         row.faults += case.faults_in()
@@ -77,7 +80,7 @@ def interrupts(case: Case, count: int, seed: int) -> Row:
     for k, moment in enumerate(np.random.default_rng(seed).random(count)):
         case.reset()
         how = (signal.SIGINT, signal.SIGTERM)[k % 2]
-        ended = runs.run(case.folder, *case.out, *NEW, before=runs.after(moment * case.whole.seconds, how))
+        ended = runs.run(case.folder, *case.command, before=runs.after(moment * case.whole.seconds, how))
         row.ended(ended)
         row.cut += "interrupted" in ended.text
         if ended.code not in (0, 130):
@@ -90,14 +93,14 @@ def interrupts(case: Case, count: int, seed: int) -> Row:
 def calls_of(case: Case) -> int:
     """How often a whole run changes the disk."""
     case.reset()
-    return runs.run(case.folder, *case.out, *NEW, before=runs.fault(case.folder, 0, kill=False)).calls
+    return runs.run(case.folder, *case.command, before=runs.fault(case.folder, 0, kill=False)).calls
 
 
 def deaths(case: Case) -> Row:
     row = Row("deaths", case.suffix)
     for call in range(1, calls_of(case) + 1):
         case.reset()
-        ended = runs.run(case.folder, *case.out, *NEW, before=runs.fault(case.folder, call, kill=True))
+        ended = runs.run(case.folder, *case.command, before=runs.fault(case.folder, call, kill=True))
         row.ended(ended)
         row.cut += ended.code < 0
         row.faults += [f"call {call}: {f}" for f in case.faults_in()]
@@ -111,7 +114,7 @@ def full(case: Case) -> Row:
     row = Row("full", case.suffix)
     for call in range(1, calls_of(case) + 1):
         case.reset()
-        ended = runs.run(case.folder, *case.out, *NEW, before=runs.fault(case.folder, call, kill=False))
+        ended = runs.run(case.folder, *case.command, before=runs.fault(case.folder, call, kill=False))
         row.ended(ended)
         row.cut += ended.code != 0
         if ended.code not in (0, 2) or (ended.code == 2 and ended.text.count("error: ") != 1):
@@ -132,10 +135,14 @@ def main() -> None:
     runs.with_faults()
     runs.prepare()
     suffixes = given.suffixes.split(",")
-    path, rows = FOLDER / "results.json", []
+    rows: list[Row] = []
+    path = FOLDER / f"results_{given.kinds.replace(',', '_')}{'_'.join(suffixes)}.json"
     for suffix in suffixes:
-        case = Case(FOLDER, suffix)
         for kind in given.kinds.split(","):
+            case = Case(FOLDER / f"{kind}{suffix}", suffix, STEPS[kind])
+            print(
+                f"{kind} {suffix}: {case.whole.seconds:.1f} s a run, {calls_of(case)} changes of the disk", flush=True
+            )
             if kind in ("deaths", "full"):
                 row = {"deaths": deaths, "full": full}[kind](case)
             else:

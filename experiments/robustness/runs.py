@@ -33,7 +33,7 @@ JOB = [
     "simplify", "in.glb", "--texture-size", "32", "--resolution", "32", "--pool", "4", "--views", "2",
     "--reallocate", "0", "--triangles", "150", "--device", "cpu", "--no-report", "--checkpoint", "state",
 ]  # fmt: skip
-OLD, NEW = ("--steps", "0"), ("--steps", "12")
+OLD = ("--steps", "0")
 """What tells the result that is there from the one that takes its place."""
 
 
@@ -69,7 +69,7 @@ def prepare() -> None:
 
 def run(folder: Path, *more: str, before: Callable[[], None] = lambda: None) -> Ended:
     """The job in ``folder``. ``before``: what happens in the process at its start."""
-    log = folder / ".log"
+    log = folder.with_name(folder.name + ".log")  # elsewhere: it is none of the files that matter
     faults = _faults()
     read, write = os.pipe()
     child = os.fork()
@@ -122,7 +122,7 @@ def fault(folder: Path, call: int, *, kill: bool) -> Callable[[], None]:
     def set_fault() -> None:
         faults = _faults()
         assert faults is not None
-        faults.fault_set(str(folder).encode(), ctypes.c_long(call), int(kill))
+        faults.fault_set(f"{folder}/".encode(), ctypes.c_long(call), int(kill))
 
     return set_fault
 
@@ -131,7 +131,9 @@ def with_faults() -> None:
     """Start this program again with the library that makes faults, if it is not loaded. Needs a C compiler."""
     if _faults() is not None:
         return
-    library = OUT / "robustness" / "faults.so"
+    if "LD_PRELOAD" in os.environ:
+        raise SystemExit("the library that makes faults cannot be loaded (LD_PRELOAD is set)")
+    library = OUT / "robustness" / f"faults_{os.getpid()}.so"
     library.parent.mkdir(parents=True, exist_ok=True)
     compiler = shutil.which("cc")
     if compiler is None:
@@ -148,26 +150,27 @@ def _faults() -> ctypes.CDLL | None:
 
 
 class Case:
-    """A folder with an input and an old result of one format, and what the new one is to be."""
+    """A folder with an input and an old result of one format, and what the new one is to be, after so many steps.
+    ``command``: what makes it."""
 
-    def __init__(self, within: Path, suffix: str) -> None:
-        self.suffix, self.folder = suffix, within / f"case{suffix.replace('.', '_')}"
+    def __init__(self, folder: Path, suffix: str, steps: int) -> None:
+        self.suffix, self.folder = suffix, folder
         shutil.rmtree(self.folder, ignore_errors=True)
         self.folder.mkdir(parents=True)
         save(two_materials(600), self.folder / "in.glb")
         self.input = (self.folder / "in.glb").read_bytes()
-        self.out = ("--out", f"low{suffix}")
-        self.whole = self._made(NEW)
+        self.command = ("--out", f"low{suffix}", "--steps", str(steps))
+        self.whole = self._made()
         self.new = self.results()
         self.psnr = _psnr(self.whole.text)
-        self._made(OLD)
+        self._made(*OLD)
         self.old = self.results()
         assert self.old.keys() <= self.new.keys() and self.old != self.new
 
-    def _made(self, options: tuple[str, ...]) -> Ended:
+    def _made(self, *options: str) -> Ended:
         for path in self.folder.glob("low*"):
             shutil.rmtree(path) if path.is_dir() else path.unlink()
-        ended = run(self.folder, *self.out, *options)
+        ended = run(self.folder, *self.command, *options)
         assert ended.code == 0, ended.text
         return ended
 
