@@ -18,20 +18,25 @@ PREFIX = b"appearance-opt: process "
 """How the content of a lock file begins."""
 
 
+FOLDER_LOCK = ".lock"
+"""The name of the lock on a folder, in it."""
+
+
 def lock_path(target: Path) -> Path:
-    """Where the lock on ``target`` lies: beside it."""
+    """Where the lock on the file ``target`` lies: beside it."""
     return target.with_name(f".{target.name}.lock")
 
 
 @contextmanager
-def locked(target: Path) -> Iterator[None]:
-    """Hold ``target`` for this process. Raises InputError naming the other process when another one holds it.
+def locked(target: Path, *, folder: bool = False) -> Iterator[None]:
+    """Hold ``target``, a file or a ``folder``, for this process. Raises InputError naming the other process when
+    another one holds it.
 
-    A file beside it names process and host. What holds is an advisory lock on that file (flock), which the system
-    drops when the process ends, however it ends: the file that a killed run leaves behind holds nothing. Folders that
-    are made for it are removed at the end if nothing else came into them.
+    A file beside it, or in the folder, names process and host. What holds is an advisory lock on that file (flock),
+    which the system drops when the process ends, however it ends: the file that a killed run leaves behind holds
+    nothing. Folders that are made for it are removed at the end if nothing else came into them.
     """
-    path = lock_path(target)
+    path = target / FOLDER_LOCK if folder else lock_path(target)
     made = [p for p in (path.parent, *path.parent.parents) if not p.exists()]
     path.parent.mkdir(parents=True, exist_ok=True)
     handle = acquire(path, target)
@@ -40,9 +45,9 @@ def locked(target: Path) -> Iterator[None]:
     finally:
         path.unlink(missing_ok=True)
         os.close(handle)
-        for folder in made:
+        for empty in made:
             try:
-                folder.rmdir()
+                empty.rmdir()
             except OSError:
                 break  # something is in it
 

@@ -46,6 +46,7 @@ class Publication:
         folder = final.parent.resolve()
         if folder not in self._staged:
             folder.mkdir(parents=True, exist_ok=True)
+            recover(folder)
             self._staged[folder] = _Staged(folder)
         return self._staged[folder].new / final.name
 

@@ -16,7 +16,7 @@ from appearance_opt.digest import digest
 from appearance_opt.errors import InputError
 from appearance_opt.fit import archive
 from appearance_opt.fit.adam import Moments
-from appearance_opt.lock import lock_path
+from appearance_opt.lock import FOLDER_LOCK
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -73,7 +73,7 @@ class Checkpointer:
 
     def _check_folder(self) -> None:
         for path in self.folder.iterdir():
-            if path.name not in archive.FILES and not _temporary(path) and path.name != lock_path(path).name:
+            if path.name not in archive.FILES and not _temporary(path) and path.name != FOLDER_LOCK:
                 raise InputError(
                     f"{self.folder}: holds '{path.name}', which is no checkpoint; choose an empty folder or a new one"
                 )

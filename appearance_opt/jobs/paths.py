@@ -103,7 +103,7 @@ class Outputs:
             longest = (
                 [path.with_suffix("").name + SUFFIX] if path.suffix.lower() == ".obj" else [path.stem + "_textures"]
             )
-            _check_names(path, [path.name, *longest])
+            _check_names(path, [lock_path(path).name, *longest])
         for folder in self.folders:
             check_folder(folder)
             _check_names(folder, [folder.name])
@@ -162,12 +162,12 @@ class Outputs:
         """While the job runs, no other run may write there. Raises InputError if one does. What a killed run has left
         half done there is undone first."""
         with ExitStack() as stack:
-            for target in dict.fromkeys(p.resolve() for p in (self.out, self.report, self.checkpoint) if p is not None):
-                stack.enter_context(locked(target))
-            for folder in {p.resolve().parent for p in (self.out, self.report) if p is not None}:
+            if self.out is not None:
+                stack.enter_context(locked(self.out.resolve()))
+                recover(self.out.resolve().parent)
+            for folder in {p.resolve() for p in (self.report, self.checkpoint) if p is not None}:
+                stack.enter_context(locked(folder, folder=True))
                 recover(folder)
-            if self.textures is not None and self.textures.is_dir():
-                recover(self.textures)
             yield
 
 
@@ -177,13 +177,13 @@ def level_path(out: Path, level: int) -> Path:
 
 
 def _check_names(path: Path, names: list[str]) -> None:
-    """Raise InputError if one of ``names``, or the name of its lock, is longer than the file system takes."""
+    """Raise InputError if one of ``names`` is longer than the file system takes."""
     there = next((p for p in path.resolve().parents if p.exists()), Path("/"))
     try:
         most = os.pathconf(there, "PC_NAME_MAX")
     except (OSError, ValueError):
         return
-    for name in (*names, lock_path(path).name):
+    for name in names:
         if len(os.fsencode(name)) > most:
             excess = len(os.fsencode(name)) - most
             raise InputError(
