@@ -98,15 +98,13 @@ class Outputs:
     def check(self) -> None:
         """Raise InputError if something could not be written where it is to be."""
         for path in self.results:
+            longest = path.stem + (SUFFIX if path.suffix.lower() == ".obj" else "_textures")
+            _check_names(path, [lock_path(path).name, longest])
             check_writable(path)
             check_folder(path.parent)
-            longest = (
-                [path.with_suffix("").name + SUFFIX] if path.suffix.lower() == ".obj" else [path.stem + "_textures"]
-            )
-            _check_names(path, [lock_path(path).name, *longest])
         for folder in self.folders:
-            check_folder(folder)
             _check_names(folder, [folder.name])
+            check_folder(folder)
 
     def check_sources(self, *sources: object) -> None:
         """Raise InputError if writing could replace a file that the user named (others than paths are passed over)."""
@@ -178,8 +176,8 @@ def level_path(out: Path, level: int) -> Path:
 
 def _check_names(path: Path, names: list[str]) -> None:
     """Raise InputError if one of ``names`` is longer than the file system takes."""
-    there = next((p for p in path.resolve().parents if p.exists()), Path("/"))
     try:
+        there = next(p for p in path.absolute().parents if p.exists())
         most = os.pathconf(there, "PC_NAME_MAX")
     except (OSError, ValueError):
         return
