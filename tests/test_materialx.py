@@ -356,7 +356,9 @@ def document(folder: Path, inputs: str = "", space: str = "", more: str = "", co
 
 def test_a_document_with_a_node_graph(tmp_path: Path) -> None:
     color = picture(tmp_path / "c.png")
-    material = document(tmp_path).meshes[0].material
+    asset = document(tmp_path)
+    assert asset.notes == ("material 'M': read from x.mtlx",)  # and not that USD cannot read it
+    material = asset.meshes[0].material
     assert material.base_color_texture is not None
     np.testing.assert_array_equal(material.base_color_texture.pixels, color)
     assert material.base_color == pytest.approx((0.5, 0.25, 1))

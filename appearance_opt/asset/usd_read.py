@@ -65,9 +65,10 @@ def load_usd(
     path = Path(path)
     check_usd(read_bytes(path), path)
     # USD prints what it warns of; here it becomes notes
+    companions = companions or Companions()
     diagnostics = UsdUtils.CoalescingDiagnosticDelegate()
     try:
-        asset = _read_stage(path, refine, variants or {}, companions or Companions(), keep_layout)
+        asset = _read_stage(path, refine, variants or {}, companions, keep_layout)
     except Tf.ErrorException as error:
         # the first of what went wrong: the place in the file, if it is text
         said = [_text(partial(getattr, one, "commentary")) for one in error.args if hasattr(one, "commentary")]
@@ -77,6 +78,8 @@ def load_usd(
     told = Notes()
     for warning in warned:
         text = _ADDRESS.sub("", warning)
+        if any(f"{file.name}@" in text for file in companions.files if file.suffix == ".mtlx"):
+            continue  # read without USD, which has no reader of MaterialX documents
         # of one kind are those that differ in paths and names of files only
         told(f"USD: {text}", re.sub(r"<[^>]*>|@[^@]*@|'[^']*'", "...", text))
     return replace(asset, notes=asset.notes + told.lines())

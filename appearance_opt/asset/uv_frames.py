@@ -134,7 +134,7 @@ def unified(
         frames = {n: f for n, f in frames_of.get(id(material), {}).items() if getattr(material, n) is not None}
         if not frames:
             for k in own:
-                out[k] = replace(meshes[k], uvs=meshes[k].uvs[:, :2])  # type: ignore[index]
+                out[k] = _first_set(meshes[k])
             continue
         textures = {n: getattr(material, n) for n in frames}
         uvs = [np.asarray(meshes[k].uvs) for k in own]
@@ -166,6 +166,10 @@ def _by_material(meshes: Sequence[Mesh]) -> list[list[int]]:
         if mesh.uvs is not None:
             out.setdefault(id(mesh.material), []).append(k)
     return list(out.values())
+
+
+def _first_set(mesh: Mesh) -> Mesh:
+    return mesh if mesh.uvs is None or mesh.uvs.shape[1] == 2 else replace(mesh, uvs=mesh.uvs[:, :2])
 
 
 def _where_sets_differ(uvs: Sequence[NDArray], frames: Mapping[str, Frame]) -> dict[str, Frame]:
@@ -221,7 +225,7 @@ def kept(
             which = ", ".join(n.replace("_texture", "").replace("_", " ") for n in moved)
             told = f"material '{material.name}': the transform of its textures ({which}) is not applied"
             note(f"{told}: the mesh keeps its texture coordinates")
-    return [m if m.uvs is None else replace(m, uvs=m.uvs[:, :2]) for m in meshes]
+    return [_first_set(m) for m in meshes]
 
 
 def alike(uvs: Sequence[NDArray], textures: Mapping[str, Texture], frames: Mapping[str, Frame]) -> bool:
