@@ -169,9 +169,8 @@ def test_all_of_a_start_is_kept(tmp_path: Path) -> None:
     def mesh() -> LatentMesh:
         return LatentMesh(*(rng.random((3, 3)) for _ in fields(LatentMesh)))
 
-    start = Start(
-        mesh(), {"red": rng.random((2, 2)), "blue": 0.5}, True, np.ones((2, 2), bool), (0, 2), mesh(), True, mesh()
-    )
+    maps, known = {"red": rng.random((2, 2)), "blue": 0.5}, np.ones((2, 2), bool)
+    start = Start(mesh(), maps, True, known, (0, 2), mesh(), True, mesh(), ("clustered first",))
     assert all(getattr(start, f.name) is not f.default for f in fields(Start)), "give each field a value of its own"
     first, _ = Checkpointer(tmp_path, "job", resume=False).start(lambda: (start, False), Start, LatentMesh)
     second, _ = Checkpointer(tmp_path, "job", resume=True).start(lambda: (None, False), Start, LatentMesh)
