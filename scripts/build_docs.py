@@ -30,7 +30,7 @@ def main(target: Path) -> None:
         for link in re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", text):
             if not (page.parent / link).exists():
                 broken.append(f"{page}: {link}")
-        body = markdown.markdown(text, extensions=["tables", "fenced_code"])
+        body = markdown.markdown(text, extensions=["tables", "fenced_code", "toc"])
         body = re.sub(r'href="([\w-]+)\.md', r'href="\1.html', body)
         title = html.escape(text.splitlines()[0].lstrip("# "))
         (target / f"{page.stem}.html").write_text(

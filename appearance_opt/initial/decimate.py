@@ -4,7 +4,7 @@ The metric is Garland and Heckbert's, with faces weighted by area times an impor
 gives: how much of the face an observer sees. Instead of one collapse at a time, each round collapses all
 cheap edges that are the cheapest of their neighbourhood; their neighbourhoods do not touch, so a round is a
 handful of array operations. Far from the budget, rounds are bolder: see ``BOLD``. What libraries do instead, and
-why it was not enough, is in docs/design.md.
+why it was not enough, is in docs/trials.md: decimation.
 """
 
 from __future__ import annotations
