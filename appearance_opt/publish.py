@@ -166,24 +166,39 @@ class _Staged:
         return self.old / new.relative_to(self.new)
 
     def write_journal(self, names: list[str]) -> None:
-        """Note which names are about to change, those that refer to others last."""
-        self.journal.write_text(json.dumps(names))
+        """Note which names are about to change, those that refer to others last, and which files are new."""
+        self.journal.write_text(json.dumps([[name, *_identity(self.new / name)] for name in names]))
         _synchronize(self.journal)
 
     def undo(self) -> None:
-        """Back to what was there before: new files go, old ones return. May be cut short and done again."""
-        try:
-            names = json.loads(self.journal.read_text())
-        except (FileNotFoundError, ValueError):
-            return  # nothing was begun
-        for name in reversed(names):
+        """Back to what was there before: new files go, old ones return. May be cut short and done again.
+
+        A journal may come from anybody who packs a folder, so it is not trusted: only files that are known by their
+        number on this disk go, nothing is replaced, and no name leads out of the folder."""
+        for name, device, number in reversed(self._noted()):
             new, final = self.new / name, self.folder / name
-            if not os.path.lexists(new) and os.path.lexists(final):
-                final.replace(new)
-        for name in names:
-            if os.path.lexists(self.old / name):
-                (self.old / name).replace(self.folder / name)
-        self.journal.unlink()
+            if not os.path.lexists(new) and os.path.lexists(final) and _identity(final) == (device, number):
+                final.rename(new)
+        for name, _, _ in self._noted():
+            if os.path.lexists(self.old / name) and not os.path.lexists(self.folder / name):
+                (self.old / name).rename(self.folder / name)
+        self.journal.unlink(missing_ok=True)
+
+    def _noted(self) -> list[tuple[str, int, int]]:
+        """(name, device, number) of the journal, as far as it is one."""
+        try:
+            rows = [
+                (str(name), int(device), int(number)) for name, device, number in json.loads(self.journal.read_text())
+            ]
+        except (OSError, ValueError, TypeError):
+            return []  # nothing was begun
+        return [
+            row
+            for row in rows
+            if all(_within(top / row[0], top) for top in (self.folder, self.new, self.old))
+            and not self.new.is_symlink()
+            and not self.old.is_symlink()
+        ]
 
     def recover(self) -> None:
         """Undo and remove what a killed process has left."""
@@ -196,6 +211,17 @@ class _Staged:
         """Remove the folder."""
         shutil.rmtree(self.root, ignore_errors=True)
         os.close(self._handle)
+
+
+def _identity(path: Path) -> tuple[int, int]:
+    """(device, number) by which a disk knows a file, whatever its name."""
+    found = path.lstat()
+    return found.st_dev, found.st_ino
+
+
+def _within(path: Path, folder: Path) -> bool:
+    """Does a file lie in a folder, without detours by links or parents?"""
+    return ".." not in path.parts and path.parent.resolve().is_relative_to(folder.resolve())
 
 
 def _synchronize(path: Path) -> None:

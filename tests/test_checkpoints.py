@@ -144,6 +144,8 @@ def test_a_new_run_leaves_nothing_of_the_old_one(ball: Asset, tmp_path: Path) ->
     appearance_opt.simplify(ball, None, options(), checkpoint=tmp_path)
     (tmp_path / ".fit-abc.tmp").write_bytes(b"half a state")
     assert {p.name for p in tmp_path.iterdir()} == {"fit.npz", "start.npz", ".fit-abc.tmp"}
+    Checkpointer(tmp_path, "the same job", resume=True)
+    assert {p.name for p in tmp_path.iterdir()} == {"fit.npz", "start.npz"}
     Checkpointer(tmp_path, "another job", resume=False)
     assert not list(tmp_path.iterdir())
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import subprocess
@@ -142,6 +143,44 @@ def test_what_a_living_process_is_writing_is_left_alone(tmp_path: Path) -> None:
         together.place(tmp_path / "root").write_text("new")
         recover(tmp_path)
     assert contents(tmp_path) == {"root": "new"}
+
+
+def planted(folder: Path, names: list[str]) -> Path:
+    """What looks like the remains of a killed run, as an archive of somebody else might bring along."""
+    root = folder / f"{PREFIX}planted"
+    for name in ("new", "old"):
+        (root / name).mkdir(parents=True)
+    (root / "lock").touch()
+    (root / "journal.json").write_text(json.dumps([[name, 1, 2] for name in names]))
+    return root
+
+
+def test_remains_that_others_planted_change_nothing(tmp_path: Path) -> None:
+    folder, outside = tmp_path / "folder", tmp_path / "outside"
+    folder.mkdir()
+    outside.mkdir()
+    (folder / "in.glb").write_text("mine")
+    (outside / "x").write_text("mine")
+    before = contents(tmp_path)
+    root = planted(folder, ["in.glb", "../outside/x", str(outside / "x"), "link/x", "../outside/y"])
+    (folder / "link").symlink_to(outside)
+    (root / "old" / "in.glb").write_text("theirs")
+    (root / "old" / "link").mkdir()
+    (root / "old" / "link" / "y").write_text("theirs")
+    (root / "outside").mkdir()
+    (root / "outside" / "y").write_text("theirs")
+    recover(folder)
+    (folder / "link").unlink()
+    assert contents(tmp_path) == before
+    root = planted(folder, ["x"])
+    (root / "old").rmdir()
+    (root / "old").symlink_to(outside)  # would take the file of somebody
+    recover(folder)
+    assert contents(tmp_path) == before
+    for nonsense in ("[", "[1]", '{"a": 1}', '[["x"]]', "[[0, 1, 2]]"):
+        (planted(folder, []) / "journal.json").write_text(nonsense)
+        recover(folder)
+        assert contents(tmp_path) == before
 
 
 def test_one_process_holds_a_name(tmp_path: Path) -> None:

@@ -68,6 +68,8 @@ class Checkpointer:
         self._last = time.monotonic()
         self.folder.mkdir(parents=True, exist_ok=True)
         self._check_folder()
+        for path in filter(_temporary, list(self.folder.iterdir())):
+            path.unlink()
         if not resume:
             self._clear()
 
@@ -90,7 +92,7 @@ class Checkpointer:
                 ) from error
         if self.path in there:
             log.warning("%s: the checkpoint of an earlier run is removed (--resume goes on from it)", self.folder)
-        for path in (*there, *filter(_temporary, self.folder.iterdir())):
+        for path in there:
             path.unlink()
 
     def start(self, make: Callable[[], tuple[T, bool]], *classes: type) -> tuple[T, bool]:

@@ -109,9 +109,10 @@ class Outputs:
     def check_sources(self, *sources: object) -> None:
         """Raise InputError if writing could replace a file that the user named (others than paths are passed over)."""
         files = [Path(s) for s in sources if isinstance(s, (str, Path))]
-        named = {path.resolve() for path in self.results}
-        if any(file.resolve() in named for file in files):
-            raise InputError(f"{self.out}: is the input itself, which is never changed; choose another name")
+        named = {file.resolve() for file in files}
+        for path in self.results:
+            if path.resolve() in named:
+                raise InputError(f"{path}: is the input itself, which is never changed; choose another name")
         self._check_files(files)
 
     def check_inputs(self, *assets: Asset | None) -> None:
