@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import threading
 import time
 from typing import TYPE_CHECKING
 
@@ -13,7 +14,8 @@ if TYPE_CHECKING:
 
 
 EVERY = 5.0
-"""Seconds between lines where there is no terminal for a bar."""
+"""Seconds between lines where there is no terminal for a bar, and before the first: what is over sooner, or refused,
+prints none."""
 
 
 class TerminalProgress:
@@ -22,7 +24,8 @@ class TerminalProgress:
 
     def __init__(self) -> None:
         self._bar: Progress | None = None
-        self._last = -EVERY
+        self._last = time.monotonic()
+        self._next: threading.Timer | None = None
 
     def __enter__(self) -> TerminalProgress:
         if sys.stderr.isatty():
@@ -38,6 +41,7 @@ class TerminalProgress:
     def __exit__(
         self, kind: type[BaseException] | None, value: BaseException | None, traceback: TracebackType | None
     ) -> None:
+        self._forget()
         if self._bar is not None:
             self._bar.stop()
 
@@ -45,8 +49,15 @@ class TerminalProgress:
         """See ``fit.loop.Progress``."""
         if self._bar is not None:
             self._bar.update(self._task, description=text, info="")
-        else:
+            return
+        self._forget()
+        left = self._last + EVERY - time.monotonic()
+        if left <= 0:
             self._print(text)
+        else:  # if it lasts
+            self._next = threading.Timer(left, self._print, (text,))
+            self._next.daemon = True
+            self._next.start()
 
     def update(
         self, step: int, fraction: float, loss: float, psnr: float, steps_per_second: float, seconds_left: float | None
@@ -56,10 +67,17 @@ class TerminalProgress:
         info = f"step {step}  loss {loss:.5f}  held-out {psnr:.2f} dB  {steps_per_second:.1f} steps/s{left}"
         if self._bar is not None:
             self._bar.update(self._task, description="fitting", completed=fraction, info=info)
-        else:
+            return
+        self._forget()
+        if time.monotonic() - self._last >= EVERY:
             self._print(f"{100 * fraction:3.0f} %  {info}")
 
     def _print(self, line: str) -> None:
-        if time.monotonic() - self._last >= EVERY:
-            self._last = time.monotonic()
-            print(line, file=sys.stderr, flush=True)
+        self._last = time.monotonic()
+        print(line, file=sys.stderr, flush=True)
+
+    def _forget(self) -> None:
+        """A line that waits for its time is not printed."""
+        if self._next is not None:
+            self._next.cancel()
+            self._next = None

@@ -159,13 +159,29 @@ def _framed(views: Views, points: NDArray) -> Views:
     return replace(turned, right=arrays[0].astype(np.float32), down=arrays[1].astype(np.float32))
 
 
-def framing(points: NDArray) -> tuple[tuple[float, float, float], float]:
-    """Centre of the axis-aligned box around ``points`` (N, 3), and the radius of the sphere around
-    that centre that holds them all."""
-    points = np.asarray(points, np.float64)
-    centre = (points.min(axis=0) + points.max(axis=0)) / 2
-    radius = float(np.sqrt(np.max(np.sum((points - centre) ** 2, axis=1))))
-    return (float(centre[0]), float(centre[1]), float(centre[2])), max(radius, 1e-12)
+def views_around(points: NDArray, seed: int, light: str = "point") -> ViewSampler:
+    """Views of an object of radius 1 around the origin, framed to its ``points`` (N, 3)."""
+    return ViewSampler((0.0, 0.0, 0.0), 1.0, seed, hull=support(np.asarray(points, np.float32)), light=light)
+
+
+SUPPORT_POINTS = 1 << 18
+"""Points of a cloud that are looked at in every direction. Of larger clouds these are taken evenly, and the extreme
+ones along axes and diagonals, so that what sticks out is not cut off."""
+
+
+def support(positions: NDArray, count: int = 256) -> NDArray[np.float64]:
+    """Extreme points of a cloud in ``count`` directions: enough to frame it from any side."""
+    if len(positions) > SUPPORT_POINTS:
+        axes = np.stack(np.meshgrid(*[[-1, 0, 1]] * 3), axis=-1).reshape(-1, 3).astype(positions.dtype)
+        far = np.unique([np.argmax(positions @ axis) for axis in axes])
+        positions = np.concatenate([positions[:: -(-len(positions) // SUPPORT_POINTS)], positions[far]])
+    k = np.arange(count) + 0.5
+    polar, azimuth = np.arccos(1 - 2 * k / count), np.pi * (1 + 5**0.5) * k
+    directions = np.stack(
+        [np.cos(azimuth) * np.sin(polar), np.sin(azimuth) * np.sin(polar), np.cos(polar)], axis=1
+    ).astype(np.float32)
+    best = np.concatenate([np.argmax(positions @ d.T, axis=0) for d in np.split(directions, 8)])
+    return positions[np.unique(best)].astype(np.float64)
 
 
 def _unit(v: NDArray) -> NDArray:

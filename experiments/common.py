@@ -73,21 +73,21 @@ def judge(
     return dict(zip(candidates, json.loads(scores.read_text())["candidates"], strict=True))
 
 
-class Framed:
-    """An asset in the frame of a fit, as a job sees it: ``asset`` moved there, ``frame`` (centre, scale), its
+class Placed:
+    """An asset placed for a fit, as a job sees it: ``asset`` in local coordinates, its ``placement``, its
     ``reference`` and the ``sampler`` of its views."""
 
     def __init__(self, asset: Asset, seed: int = 0) -> None:
         from appearance_opt.jobs.parts import split
-        from appearance_opt.jobs.simplify import in_frame, support
+        from appearance_opt.placement import Placement
         from appearance_opt.reference.mesh import MeshReference
-        from appearance_opt.views import ViewSampler, framing
+        from appearance_opt.views import views_around
 
         asset = split(asset, asset.name, "fit").fitted
-        self.frame = framing(asset.points())
-        self.asset = in_frame(asset, *self.frame)
+        self.placement = Placement.around(asset.points())
+        self.asset = self.placement.local(asset)
         self.reference = MeshReference(self.asset)
-        self.sampler = ViewSampler((0.0, 0.0, 0.0), 1.0, seed, hull=support(self.reference.merged.positions))
+        self.sampler = views_around(self.reference.merged.positions, seed)
 
 
 class Kept:

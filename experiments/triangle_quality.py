@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from experiments.common import ASSETS, Framed, Missing, asset, source_of
+from experiments.common import ASSETS, Missing, Placed, asset, source_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -114,17 +114,17 @@ def rows(name: str, ratios: list[float], decimate: Callable[..., tuple]) -> list
     from appearance_opt.initial.visibility import importance, pixel_counts
     from appearance_opt.views import VISIBILITY
 
-    framed = Framed(loaded(name))
-    merged = framed.reference.merged
+    placed = Placed(loaded(name))
+    merged = placed.reference.merged
     count = len(merged.faces)
-    pixels = pixel_counts(framed.reference.scene, count, framed.sampler.held_out(VISIBILITY), 160)
+    pixels = pixel_counts(placed.reference.scene, count, placed.sampler.held_out(VISIBILITY), 160)
     weight, seen = importance(merged.positions, merged.faces, pixels)
     before, _ = shapes(merged.positions, merged.faces)
     out = []
     for ratio in ratios:
         began = time.perf_counter()
         budget = max(round(ratio * count), LEAST)
-        p, f, *_ = decimate(merged.positions, merged.faces[seen], budget, weight[seen], framed.reference.single[seen])
+        p, f, *_ = decimate(merged.positions, merged.faces[seen], budget, weight[seen], placed.reference.single[seen])
         seconds = time.perf_counter() - began
         slivers, folded = shapes(p, f)
         shares = f"{100 * before:.1f} | {100 * slivers:.1f} ({round(slivers * len(f))})"

@@ -18,7 +18,7 @@ from appearance_opt.asset.types import Asset, Mesh
 from appearance_opt.baking.align import align
 from appearance_opt.baking.check import check_place, misfit
 from appearance_opt.errors import InputError
-from appearance_opt.jobs.simplify import in_frame
+from appearance_opt.placement import Placement
 from tests.conftest import grid_sphere, make_asset
 from tests.test_asset_gltf import write_glb
 from tests.test_asset_gltf_nodes import document
@@ -137,7 +137,7 @@ def test_the_place_is_written(tmp_path: Path, suffix: str) -> None:
 def test_the_frame_of_a_job_does_not_know_the_origin() -> None:
     ball = make_asset(8, 16)
     far = replace(ball, origin=tuple(PLACE))
-    near, moved = in_frame(ball, (0, 0, 0), 1), in_frame(far, tuple(PLACE), 1)
+    near, moved = Placement().local(ball), Placement(tuple(PLACE)).local(far)
     np.testing.assert_array_equal(moved.meshes[0].positions, near.meshes[0].positions)
     assert moved.origin == (0, 0, 0)
 

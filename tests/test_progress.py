@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import re
+from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 
@@ -13,6 +15,9 @@ from appearance_opt.asset import save
 from appearance_opt.asset.types import Asset
 from appearance_opt.initial.decimate import decimate_with_source
 from appearance_opt.progress import TerminalProgress
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
 
 
 class Listener:
@@ -58,15 +63,37 @@ def test_decimation_tells_how_far_it_is(ball: Asset) -> None:
 def test_without_a_terminal_lines_come_now_and_then(
     capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    now = [100.0]
+    now, waiting = [100.0], []
+
+    class Timer:
+        """What ``threading.Timer`` does, when the test says so."""
+
+        def __init__(self, seconds: float, call: Callable, arguments: tuple) -> None:
+            assert 0 < seconds <= terminal.EVERY
+            self.due = partial(call, *arguments)
+
+        def start(self) -> None:
+            waiting.append(self)
+
+        def cancel(self) -> None:
+            if self in waiting:
+                waiting.remove(self)
+
     monkeypatch.setattr(terminal.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(terminal.threading, "Timer", Timer)
     with TerminalProgress() as shown:
         shown.stage("reading x.glb")
-        shown.stage("preparing")  # too early for another line
+        assert not capsys.readouterr().err  # nothing, if it is refused now
+        shown.stage("preparing")
+        assert len(waiting) == 1
         now[0] += terminal.EVERY
+        waiting.pop().due()  # it lasts
         shown.stage("decimating")
         now[0] += terminal.EVERY
         shown.update(3, 0.5, 0.1, 30.0, 2.0, None)
+        shown.update(4, 0.5, 0.1, 30.0, 2.0, None)
+        shown.stage("writing")
+    assert not waiting
     lines = capsys.readouterr().err.splitlines()
-    assert lines[:2] == ["reading x.glb", "decimating"]
-    assert len(lines) == 3 and "step 3" in lines[2]
+    assert lines[0] == "preparing"
+    assert len(lines) == 2 and "step 3" in lines[1]

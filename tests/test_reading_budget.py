@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from appearance_opt.asset import images, load, mtl, uv_frames
+from appearance_opt.asset import images, load, mtl, resampling, uv_frames
 from appearance_opt.asset.budget import BYTES, Budget
 from appearance_opt.asset.companions import Companions
 from appearance_opt.asset.polygons import MOST_CORNERS, Polygons, triangulate
@@ -115,10 +115,10 @@ def test_upright_grids_are_resampled_as_other_places_are() -> None:
         texture = Texture(rng.integers(0, 255, (5, 7, 3)).astype(np.uint8), "srgb", wrap)
         u, v = rng.uniform(-2, 2, 11), rng.uniform(-2, 2, 13)
         y, x = np.meshgrid(v, u, indexing="ij")
-        wanted = uv_frames.bilinear(texture, np.stack([x.ravel(), y.ravel()], 1)).reshape(13, 11, 3)
-        np.testing.assert_allclose(uv_frames._bilinear_grid(texture, u, v), wanted, atol=1e-9)
+        wanted = resampling.bilinear(texture, np.stack([x.ravel(), y.ravel()], 1)).reshape(13, 11, 3)
+        np.testing.assert_allclose(resampling.bilinear_grid(texture, u, v), wanted, atol=1e-9)
         middles = (np.arange(-7, 14) + 0.5) / 7
-        copied = uv_frames._bilinear_grid(texture, middles, (np.arange(5) + 0.5) / 5)
+        copied = resampling.bilinear_grid(texture, middles, (np.arange(5) + 0.5) / 5)
         assert copied.dtype == np.uint8
         np.testing.assert_array_equal(copied[:, 7:14], texture.pixels)
 

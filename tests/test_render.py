@@ -13,12 +13,13 @@ from scipy.ndimage import maximum_filter
 from appearance_opt.asset.types import Asset, Material, Mesh, Texture
 from appearance_opt.initial.sphere import sphere
 from appearance_opt.latent.texels import TexelCodec
+from appearance_opt.placement import Placement
 from appearance_opt.reference.mesh import MeshReference
 from appearance_opt.render import rays, upload
 from appearance_opt.render.deferred import Grid
 from appearance_opt.render.math import angle_of
 from appearance_opt.render.texture import CLAMP, MIRROR, REPEAT, build_pyramid
-from appearance_opt.views import ViewSampler, framing, look_at
+from appearance_opt.views import ViewSampler, look_at
 from experiments import mitsuba_peer
 from experiments.accuracy.images import compare_asset
 
@@ -129,8 +130,8 @@ def test_our_image_equals_mitsubas(ball: Asset) -> None:
 def test_framing_fills_the_image_from_every_side() -> None:
     rng = np.random.default_rng(0)
     points = rng.normal(size=(500, 3)) * [0.2, 1.0, 0.1]
-    centre, radius = framing(points)
-    sampler = ViewSampler(centre, radius, seed=1, hull=points)
+    placement = Placement.around(points)
+    sampler = ViewSampler(placement.centre, placement.scale, seed=1, hull=points)
     views = sampler.draw(0, 8)
     for k in range(8):
         v = points - views.eye[k]

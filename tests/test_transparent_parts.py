@@ -20,6 +20,7 @@ from appearance_opt.jobs.fitting import Stopwatch
 from appearance_opt.jobs.parts import split
 from appearance_opt.jobs.simplify import fingerprint
 from appearance_opt.jobs.start import atlas_of
+from appearance_opt.placement import Placement
 from tests.conftest import grid_sphere
 
 QUICK = {"texture_size": 64, "resolution": 48, "pool": 4, "views": 2, "steps": 0, "reallocate": 0}
@@ -114,8 +115,7 @@ def test_nothing_left_to_work_on_is_refused(tmp_path: Path, snow_globe: Asset) -
 
 
 def test_a_start_from_a_file_leaves_its_transparent_parts_out(snow_globe: Asset) -> None:
-    frame = ((0.0, 0.0, 0.0), 1.0)
-    mesh, notes = atlas_of(snow_globe, frame, 5000, options(triangles=None, init="globe.glb"), np.zeros(1, bool))
+    mesh, notes = atlas_of(snow_globe, Placement(), 5000, options(triangles=None, init="globe.glb"), np.zeros(1, bool))
     assert len(mesh.faces) == len(snow_globe.meshes[1].faces)
     assert "of --init are left out" in notes[0]
 
@@ -157,9 +157,9 @@ def test_what_is_aligned_is_aligned_whole(snow_globe: Asset) -> None:
     for mesh, name in zip(job.high.meshes, ("ball", "shell", "sticker"), strict=True):
         expected = next(m for m in snow_globe.meshes if m.name == name)
         np.testing.assert_allclose(mesh.positions, expected.positions, atol=2e-3)
-    sampler, frame = job.view_of_all()
-    assert frame[1] > 1.04  # the label, at 1.05, is in the picture
-    assert job.frame[1] < 0.6
+    sampler, placement = job.view_of_all()
+    assert placement.scale > 1.04  # the label, at 1.05, is in the picture
+    assert job.placement.scale < 0.6
     assert sampler.hull is not None
 
 

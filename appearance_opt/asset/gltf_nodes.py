@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from appearance_opt.asset.placement import Placement
+from appearance_opt.asset.instances import Instances
 from appearance_opt.errors import InputError
 
 if TYPE_CHECKING:
@@ -71,11 +71,11 @@ class Nodes:
             if steps > len(self.nodes):
                 raise InputError(f"{self.path}: node {index} is its own ancestor")
 
-    def placement(self, node: dict[str, Any], world: NDArray) -> Placement:
+    def placement(self, node: dict[str, Any], world: NDArray) -> Instances:
         """Where the mesh of a node that has no skin goes: to one place, or to that of each instance
         (EXT_mesh_gpu_instancing, whose transforms lie between the mesh and the node)."""
         if INSTANCING not in node.get("extensions", {}):
-            return Placement(world[None])
+            return Instances(world[None])
         accessors = node["extensions"][INSTANCING]["attributes"]
         given = {key: self.document.accessor(accessors[key.upper()]) for key in _TRANSFORM if key.upper() in accessors}
         counts = {len(v) for v in given.values()}
@@ -86,9 +86,9 @@ class Nodes:
             np.broadcast_to(given.get(key, np.array(default)), (count, len(default)))
             for key, default in _TRANSFORM.items()
         )
-        return Placement(world @ composed(*each))
+        return Instances(world @ composed(*each))
 
-    def skinned(self, skin: int, attributes: dict[str, Any], read: Callable[[str], NDArray]) -> Placement:
+    def skinned(self, skin: int, attributes: dict[str, Any], read: Callable[[str], NDArray]) -> Instances:
         """Where the vertices of a skinned primitive are at rest (glTF 2.0, 3.7.3): the sum of weight * world of the
         joint * inverse bind matrix. The transform of the mesh's own node does not count. ``read``: an attribute."""
         joints = self._rest(skin)
@@ -100,7 +100,7 @@ class Nodes:
         blended = np.zeros((len(index), 4, 4))
         for k in range(index.shape[1]):
             blended += weights[:, k, None, None] * joints[index[:, k]]
-        return Placement(blended, skinned=True)
+        return Instances(blended, skinned=True)
 
     def _rest(self, skin: int) -> NDArray[np.float64]:
         """(J, 4, 4) world of the joint * inverse bind matrix, for each joint of a skin."""

@@ -15,9 +15,9 @@ from appearance_opt.asset.gltf_draco import DRACO, Compressed
 from appearance_opt.asset.gltf_materials import READ_EXTENSIONS, VARIANTS, MaterialReader
 from appearance_opt.asset.gltf_meshopt import MESHOPT
 from appearance_opt.asset.gltf_nodes import INSTANCING, Nodes
+from appearance_opt.asset.instances import placed
 from appearance_opt.asset.normals import unit
 from appearance_opt.asset.origin import settle
-from appearance_opt.asset.placement import placed
 from appearance_opt.asset.types import Asset, Contents, Mesh
 from appearance_opt.errors import InputError
 

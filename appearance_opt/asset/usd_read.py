@@ -14,11 +14,11 @@ from appearance_opt.asset import usd_shapes, uv_frames
 from appearance_opt.asset.alpha import OPAQUE
 from appearance_opt.asset.batch import smoothed
 from appearance_opt.asset.companions import Companions
+from appearance_opt.asset.instances import Instances, placed
 from appearance_opt.asset.normals import accumulate, unit
 from appearance_opt.asset.notes import Notes
 from appearance_opt.asset.origin import settle
 from appearance_opt.asset.paths import check_inside, common_folder, read_bytes
-from appearance_opt.asset.placement import Placement, placed
 from appearance_opt.asset.polygons import Polygons, triangulate
 from appearance_opt.asset.rows import ranked, unique_rows
 from appearance_opt.asset.subdivide import Sharpness, catmull_clark
@@ -300,16 +300,16 @@ class _Reader:
                 meshes += [self._put(one, place) for one in smoothed(self._parts(part))]
         return meshes
 
-    def _put(self, mesh: Mesh, place: Placement) -> Mesh:
+    def _put(self, mesh: Mesh, place: Instances) -> Mesh:
         """A mesh at all its places."""
         self.companions.budget.take_copies(mesh, place.copies, self.path)
         return placed(mesh, place, mesh.name)
 
-    def _place(self, to_world: Any) -> Placement:
+    def _place(self, to_world: Any) -> Instances:
         """Where the copies of a mesh are, in metres, Y up; ``to_world``: (P, 4, 4) for rows, as USD has them."""
         metres = np.eye(4)
         metres[:3, :3] = self.to_metres
-        return Placement(metres @ np.asarray(to_world).transpose(0, 2, 1))
+        return Instances(metres @ np.asarray(to_world).transpose(0, 2, 1))
 
     def _parts(self, prim: Any) -> list[Mesh]:
         """The triangles of a mesh or a shape in its own frame, in double precision, one mesh for each material. What

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from appearance_opt.asset.uv_frames import BAND, MAX_TEXELS, Resampled, bilinear
+from appearance_opt.asset.resampling import BAND, MAX_TEXELS, Resampled, bilinear
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

@@ -17,8 +17,6 @@ from appearance_opt.latent.latent import LatentMesh
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from numpy.typing import NDArray
-
 
 @dataclass(frozen=True)
 class Low:
@@ -54,11 +52,6 @@ def prepare(asset: Asset) -> Low:
     latent = LatentMesh(positions, faces, np.arange(len(positions), dtype=np.int32), faces, uvs, normals, tangents)
     latent = replace(latent, single=single_sided(asset.meshes))
     return Low(replace(asset, meshes=tuple(meshes)), latent)
-
-
-def moved(mesh: LatentMesh, centre: NDArray, scale: float) -> LatentMesh:
-    """The mesh moved by -centre and divided by scale."""
-    return replace(mesh, positions=((mesh.positions.astype(np.float64) - centre) / scale).astype(np.float32))
 
 
 def movable(mesh: LatentMesh) -> LatentMesh:

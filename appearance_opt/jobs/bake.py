@@ -16,6 +16,7 @@ from appearance_opt.errors import DivergedError, InputError
 from appearance_opt.interrupts import Interrupts
 from appearance_opt.jobs.parts import split
 from appearance_opt.jobs.paths import Outputs
+from appearance_opt.placement import Placement
 from appearance_opt.publish import Publication, publication
 
 if TYPE_CHECKING:
@@ -161,10 +162,9 @@ class BakeJob:
         interrupts: Interrupts,
     ) -> None:
         from appearance_opt.baking import check
-        from appearance_opt.baking.low import moved, prepare, unwrapped
-        from appearance_opt.jobs.simplify import in_frame, support
+        from appearance_opt.baking.low import prepare, unwrapped
         from appearance_opt.reference.mesh import MeshReference
-        from appearance_opt.views import ViewSampler, framing
+        from appearance_opt.views import views_around
 
         self.options, self.watch, self.interrupts, self.low_parts = options, watch, interrupts, low_parts
         high, low = high_parts.fitted, low_parts.fitted
@@ -182,11 +182,11 @@ class BakeJob:
         if not options.unwrap:
             check.check_overlap(self.low.mesh, name)
         watch.lap("check")
-        self.frame = framing(np.concatenate([high.points(), low.points()]))
-        self.reference = MeshReference(in_frame(high, *self.frame))
-        self.mesh = moved(self.low.mesh, np.array(self.frame[0]) - low.origin, self.frame[1])
-        hull = support(self.reference.merged.positions)
-        self.sampler = ViewSampler((0.0, 0.0, 0.0), 1.0, options.seed, hull=hull, light=options.light)
+        self.placement = Placement.around(np.concatenate([high.points(), low.points()]))
+        self.reference = MeshReference(self.placement.local(high))
+        local = self.placement.relative_to(low.origin).to_local(self.low.mesh.positions)
+        self.mesh = replace(self.low.mesh, positions=local.astype(np.float32))
+        self.sampler = views_around(self.reference.merged.positions, options.seed, options.light)
         watch.lap("reference")
 
     def _aligned(self, high_parts: Parts, low: Asset) -> tuple[Asset, Asset]:
@@ -202,16 +202,16 @@ class BakeJob:
         )
         return placed, replace(high_parts, fitted=placed, kept=kept).whole
 
-    def view_of_all(self) -> tuple[ViewSampler, tuple[tuple[float, float, float], float]]:
-        """(sampler, frame) of views for a report, which shows transparent parts, too."""
-        from appearance_opt.jobs.simplify import framed
+    def view_of_all(self) -> tuple[ViewSampler, Placement]:
+        """(sampler, placement) of views for a report, which shows transparent parts, too."""
+        from appearance_opt.views import views_around
 
         low = self.low_parts.whole
         if not any(map(seen_through, (*self.high.meshes, *low.meshes))):
-            return self.sampler, self.frame
+            return self.sampler, self.placement
         points = np.concatenate([self.high.points(), low.points()])
-        frame, sampler = framed(points, self.options.seed, self.options.light)
-        return sampler, frame
+        placement = Placement.around(points)
+        return views_around(placement.to_local(points), self.options.seed, self.options.light), placement
 
     def run(self, progress: Progress | None, with_report: bool) -> tuple[BakeResult, DivergedError | None]:
         """The closed form, and the fit that starts from it."""
@@ -231,7 +231,7 @@ class BakeJob:
             self._in_metres(baked.maps),
             baked.covered,
             baked.missed,
-            baked.reach * self.frame[1],
+            baked.reach * self.placement.scale,
             notes=self.notes,
         )
         parts = self._fitted_parts()
@@ -259,12 +259,12 @@ class BakeJob:
     @property
     def cage(self) -> float | None:
         """``--cage`` in units of the frame; None for the automatic one."""
-        return None if self.options.cage is None else self.options.cage / self.frame[1]
+        return None if self.options.cage is None else self.options.cage / self.placement.scale
 
     def _settings(self):
         from appearance_opt.baking.closed_form import FIELDS, Settings
 
-        o, scale = self.options, self.frame[1]
+        o, scale = self.options, self.placement.scale
         wanted = {n for n in FIELDS if o.wants(n)}
         if self.reference.emission is None and "emission" in wanted:
             wanted.remove("emission")
@@ -296,7 +296,7 @@ class BakeJob:
 
     def check_missed(self, baked: BakedMaps) -> None:
         """Raise InputError if most rays found nothing; a note if some did."""
-        reach = f"{baked.reach * self.frame[1]:.4g} m"
+        reach = f"{baked.reach * self.placement.scale:.4g} m"
         share = baked.missed_share
         if share > MISSED_ERROR:
             raise InputError(
@@ -307,7 +307,7 @@ class BakeJob:
             self.notes.append(f"{100 * share:.1f} % of the texels found nothing within {reach} and were filled")
 
     def _in_metres(self, maps: dict[str, NDArray]) -> dict[str, NDArray[np.float32]]:
-        scale = self.frame[1]
+        scale = self.placement.scale
         factors = {"displacement": scale, "curvature": 1 / scale}
         return {n: v * np.float32(factors[n]) if n in factors else v for n, v in maps.items()}
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,25 +13,12 @@ from appearance_opt.asset.alpha import kind_of
 from appearance_opt.config import DEVICES
 from appearance_opt.errors import InputError
 from appearance_opt.jobs.paths import Outputs
+from appearance_opt.placement import Placement
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from appearance_opt.asset.companions import MissingTextures
     from appearance_opt.asset.types import Asset
-    from appearance_opt.evaluate.metrics import Metrics
-    from appearance_opt.views import Views, ViewSampler
-
-
-@dataclass
-class Comparison:
-    """``metrics`` over the views; images (B, H, W, 4) premultiplied linear radiance and coverage; ``notes``: what the
-    loader dropped, repaired or assumed."""
-
-    metrics: Metrics
-    reference: NDArray[np.float32]
-    candidate: NDArray[np.float32]
-    notes: tuple[str, ...] = ()
+    from appearance_opt.evaluate.comparison import Comparison
 
 
 def compare(
@@ -81,15 +68,16 @@ def _compared(
     outputs.check_inputs(first, second)
     outputs.check_room(0, None)
     backend.select(device)
-    from appearance_opt.jobs.simplify import framed, in_frame
-    from appearance_opt.views import MEASURED
+    from appearance_opt.evaluate.comparison import compare_local
+    from appearance_opt.views import MEASURED, views_around
 
-    frame, sampler = framed(np.concatenate([first.points(), second.points()]), seed)
-    sampler = sampler.held_out(MEASURED)
+    points = np.concatenate([first.points(), second.points()])
+    placement = Placement.around(points)
+    sampler = views_around(placement.to_local(points), seed).held_out(MEASURED)
     apart = _apart(first, second)
-    in_one = in_frame(first, *frame), in_frame(second, *frame)
+    in_one = placement.local(first), placement.local(second)
     try:
-        result = compare_in_frame(*in_one, sampler, views, resolution, samples)
+        result = compare_local(*in_one, sampler, views, resolution, samples)
     except InputError as error:  # of two small things far from each other, pictures may show neither
         raise InputError("; ".join([str(error), *apart])) from error
     if outputs.report is not None:
@@ -116,28 +104,3 @@ def _drawn_otherwise(*assets: Asset) -> list[str]:
     if all(kind_of(m.material) != "transmission" for a in assets for m in a.meshes):
         return []
     return ["transmission is drawn like blended alpha: nothing is refracted, coloured inside or blurred"]
-
-
-def compare_in_frame(
-    reference: Asset, candidate: Asset, sampler: ViewSampler, views: int, resolution: int, samples: int
-) -> Comparison:
-    """The same for assets that lie in the sampler's frame."""
-    from appearance_opt.evaluate.metrics import compare_images
-
-    drawn = sampler.draw(0, views)
-    first, second = (render_asset(a, drawn, resolution, samples) for a in (reference, candidate))
-    for name, image, side in ((reference.name, first, "reference"), (candidate.name, second, "candidate")):
-        if not image[..., 3].any():
-            raise InputError(
-                f"{name}: nothing of it is seen in any of the {views} views, so that there is nothing to compare; "
-                f"is the {side} far smaller than the other, inside out, or altogether transparent?"
-            )
-    return Comparison(compare_images(first, second), first, second)
-
-
-def render_asset(asset: Asset, views: Views, resolution: int, samples: int) -> NDArray[np.float32]:
-    """Images (B, H, W, 4) of an asset; the device memory of its textures is released afterwards."""
-    from appearance_opt.reference.mesh import MeshReference
-    from appearance_opt.reference.pool import checked
-
-    return checked(MeshReference(asset).render(views, resolution, samples), len(views), resolution, asset.name)

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from appearance_opt.config import CommonOptions
     from appearance_opt.fit.model import Model
     from appearance_opt.latent.latent import LatentMesh
+    from appearance_opt.placement import Placement
     from appearance_opt.reference.mesh import MeshReference
 
 FILLED = 0.6
@@ -126,11 +127,10 @@ def without_outliers(heights: NDArray[np.float32], tolerance: float) -> NDArray[
 
 class Exporter:
     """Assets of a displaced model, in the place and scale of the input, relative to its ``origin``.
-    ``centre``, in the world, and ``scale``: of the frame in which the model was fitted."""
+    ``placement``: of the model in the world."""
 
-    def __init__(self, centre: Origin, scale: float, origin: Origin, name: str) -> None:
-        self.centre, self.scale = np.array(centre) - np.array(origin), scale
-        self.origin, self.name = origin, name
+    def __init__(self, placement: Placement, origin: Origin, name: str) -> None:
+        self.placement, self.origin, self.name = placement.relative_to(origin), origin, name
 
     def base(self, model: Model, maps: dict) -> Asset:
         """The base mesh, its maps, and the displacement map in metres."""
@@ -138,7 +138,7 @@ class Exporter:
         heights = model.host_displacement()
         if heights is None:
             return asset
-        displacement = displacement_of(heights * np.float32(self.scale))
+        displacement = displacement_of(heights * np.float32(self.placement.scale))
         meshes = (replace(m, material=replace(m.material, displacement=displacement)) for m in asset.meshes)
         return replace(asset, meshes=tuple(meshes))
 
@@ -147,8 +147,7 @@ class Exporter:
         return {k: self._asset(*model.host_drawn(k), maps, f"{self.name}_level{k}") for k in model.levels}
 
     def _asset(self, mesh: LatentMesh, positions: NDArray, maps: dict, name: str) -> Asset:
-        placed = positions.astype(np.float64) * self.scale + self.centre
-        return replace(to_asset(mesh, placed, maps, name), origin=self.origin)
+        return replace(to_asset(mesh, self.placement.to_world(positions), maps, name), origin=self.origin)
 
 
 def write_companion(asset: Asset, out: Path) -> None:

@@ -117,7 +117,7 @@ def _fitted(job: BakeJob, options: BakeOptions, progress: Progress | None, with_
         progress=progress,
         with_report=with_report,
     )
-    exporter = Exporter(*job.frame, light.origin, light.name)
+    exporter = Exporter(job.placement, light.origin, light.name)
     initial = Model(mesh, start.maps, frozenset(), Rates(), start.levels[-1:])
     final = clean_maps(model, start.known)
     if options.wants("emission"):

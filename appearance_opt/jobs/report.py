@@ -11,9 +11,9 @@ from appearance_opt import backend
 from appearance_opt.baking.encode import coverage_picture
 from appearance_opt.config import as_dict
 from appearance_opt.evaluate import pictures
+from appearance_opt.evaluate.comparison import Comparison, render_asset
 from appearance_opt.evaluate.metrics import compare_images
 from appearance_opt.evaluate.report import ReportData, write_report
-from appearance_opt.jobs.compare import Comparison, render_asset
 from appearance_opt.reference.mesh import MeshReference
 from appearance_opt.render.rays import MISS, trace
 from appearance_opt.views import MEASURED, Views
@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from appearance_opt.evaluate.metrics import Metrics
     from appearance_opt.jobs.bake import BakeResult
     from appearance_opt.jobs.simplify import SimplifyResult
+    from appearance_opt.placement import Placement
     from appearance_opt.views import ViewSampler
 
 VIEWS, RESOLUTION, SAMPLES = 8, 384, 9
@@ -37,13 +38,13 @@ def write_simplify_report(
     source: Asset,
     result: SimplifyResult,
     sampler: ViewSampler,
-    frame: tuple[tuple[float, float, float], float],
+    placement: Placement,
     options: CommonOptions,
 ) -> None:
     """Report of a simplification: start and result against the source."""
     names = ("start", f"level {max(result.tessellated)}" if result.tessellated else "result")
-    metrics, per_view = _measured(source, result.start, result.shown, names, sampler, frame)
-    metrics.update(_level_metrics(source, result, sampler, frame))
+    metrics, per_view = _measured(source, result.start, result.shown, names, sampler, placement)
+    metrics.update(_level_metrics(source, result, sampler, placement))
     data = ReportData(
         title=f"{source.name}: {result.source_triangles:,} to {result.triangles:,} triangles",
         facts=_facts(result, options),
@@ -57,17 +58,15 @@ def write_simplify_report(
 
 
 def _level_metrics(
-    source: Asset, result: SimplifyResult, sampler: ViewSampler, frame: tuple[tuple[float, float, float], float]
+    source: Asset, result: SimplifyResult, sampler: ViewSampler, placement: Placement
 ) -> dict[str, Metrics]:
     """The coarser tessellation levels on the same views."""
-    from appearance_opt.jobs.simplify import in_frame
-
     if len(result.tessellated) < 2:
         return {}
     views = sampler.held_out(MEASURED).draw(0, VIEWS)
-    reference = render_asset(in_frame(source, *frame), views, RESOLUTION, SAMPLES)
+    reference = render_asset(placement.local(source), views, RESOLUTION, SAMPLES)
     return {
-        f"level {k}": compare_images(reference, render_asset(in_frame(a, *frame), views, RESOLUTION, SAMPLES))
+        f"level {k}": compare_images(reference, render_asset(placement.local(a), views, RESOLUTION, SAMPLES))
         for k, a in sorted(result.tessellated.items())[:-1]
     }
 
@@ -77,12 +76,12 @@ def write_bake_report(
     high: Asset,
     result: BakeResult,
     sampler: ViewSampler,
-    frame: tuple[tuple[float, float, float], float],
+    placement: Placement,
     options: BakeOptions,
 ) -> None:
     """Report of a bake: closed form and fit against HIGH (as it was aligned)."""
     names = ("closed form", "fitted" if result.fit is not None else "result")
-    metrics, per_view = _measured(high, result.closed_form, result.asset, names, sampler, frame)
+    metrics, per_view = _measured(high, result.closed_form, result.asset, names, sampler, placement)
     fit = result.fit
     facts: dict[str, object] = {
         "triangles": f"{result.asset.triangle_count} of {high.triangle_count}",
@@ -112,16 +111,14 @@ def _measured(
     result: Asset,
     names: tuple[str, str],
     sampler: ViewSampler,
-    frame: tuple[tuple[float, float, float], float],
+    placement: Placement,
 ) -> tuple[dict[str, Metrics], list[dict[str, NDArray[np.uint8]]]]:
     """(metrics of start and result, which ``names`` names, on held-out views of the source; pictures of some of
     the views). One column is left out if the two are the same."""
-    from appearance_opt.jobs.simplify import in_frame
-
     views = sampler.held_out(MEASURED).draw(0, VIEWS)
-    reference, last = (render_asset(in_frame(a, *frame), views, RESOLUTION, SAMPLES) for a in (source, result))
-    first = last if start is result else render_asset(in_frame(start, *frame), views, RESOLUTION, SAMPLES)
-    triangles = triangle_images(in_frame(result, *frame), views[:PICTURED], 2 * RESOLUTION)
+    reference, last = (render_asset(placement.local(a), views, RESOLUTION, SAMPLES) for a in (source, result))
+    first = last if start is result else render_asset(placement.local(start), views, RESOLUTION, SAMPLES)
+    triangles = triangle_images(placement.local(result), views[:PICTURED], 2 * RESOLUTION)
     metrics = {names[0]: compare_images(reference, first)}
     if start is not result:
         metrics[names[1]] = compare_images(reference, last)

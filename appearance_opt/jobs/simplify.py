@@ -7,23 +7,20 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from appearance_opt import __version__, backend
 from appearance_opt.asset import load, write
-from appearance_opt.asset.origin import ZERO
 from appearance_opt.config import CommonOptions, SimplifyOptions, with_values
 from appearance_opt.digest import digest
 from appearance_opt.errors import DivergedError, InputError
 from appearance_opt.interrupts import Interrupts
 from appearance_opt.jobs.parts import split
 from appearance_opt.jobs.paths import Outputs, level_path
+from appearance_opt.placement import Placement
 from appearance_opt.publish import publication
+from appearance_opt.views import views_around
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
-
-    from numpy.typing import NDArray
 
     from appearance_opt.asset.types import Asset
     from appearance_opt.fit.checkpoint import Checkpointer
@@ -32,7 +29,6 @@ if TYPE_CHECKING:
     from appearance_opt.jobs.growth import Effort
     from appearance_opt.jobs.parts import Parts
     from appearance_opt.jobs.start import Start
-    from appearance_opt.views import ViewSampler
 
 log = logging.getLogger(__name__)
 
@@ -135,9 +131,11 @@ def _simplified(
     interrupts.release()
     if result.error is not None:
         raise result.error
-    frame, sampler = run.frame, run.sampler
-    if parts.kept:  # they may lie outside of the frame of the fit
-        frame, sampler = framed(parts.whole.points(), options.seed, options.light)
+    placement, sampler = run.placement, run.sampler
+    if parts.kept:  # they may lie outside of what the fit's views show
+        points = parts.whole.points()
+        placement = Placement.around(points)
+        sampler = views_around(placement.to_local(points), options.seed, options.light)
     del run
 
     def write_report() -> None:
@@ -146,7 +144,7 @@ def _simplified(
         # the report uploads what it draws: a heavy reference need not be held twice
         backend.release_memory()
         assert outputs.report is not None
-        write_simplify_report(outputs.report, parts.whole, result, sampler, frame, options)
+        write_simplify_report(outputs.report, parts.whole, result, sampler, placement, options)
 
     conclude(result, watch, None if outputs.report is None else write_report)
     return result
@@ -198,7 +196,6 @@ class _Job:
         from appearance_opt.jobs.growth import grown, mended
         from appearance_opt.jobs.start import atlas_of, budget, make_start, sided, transferred
         from appearance_opt.reference.mesh import MeshReference
-        from appearance_opt.views import ViewSampler, framing
 
         self.options, self.watch, self.interrupts = options, watch, interrupts
         self.progress, self.checkpointer, self.with_report = progress, checkpointer, with_report
@@ -208,14 +205,10 @@ class _Job:
             *parts.told("pass into the result as they are, and count for no --triangles or --ratio"),
         ]
         watch.begin(f"preparing {asset.triangle_count:,} triangles")
-        self.frame = framing(asset.points())
-        # the fit works on an object of radius 1 around the origin, so that no threshold in it and no
-        # digit of a float depends on the scale and place of the input
-        self.reference = MeshReference(in_frame(asset, *self.frame))
+        self.placement = Placement.around(asset.points())
+        self.reference = MeshReference(self.placement.local(asset))
         watch.lap("reference")
-        self.sampler = ViewSampler(
-            (0.0, 0.0, 0.0), 1.0, options.seed, hull=support(self.reference.merged.positions), light=options.light
-        )
+        self.sampler = views_around(self.reference.merged.positions, options.seed, options.light)
         if options.init == "sphere" and "shape" in options.fit and not options.displaced:
             triangles = budget(options, asset.triangle_count)
             self.start = self._shaped(lambda effort: grown(self.reference, self.sampler, options, triangles, effort))
@@ -227,7 +220,7 @@ class _Job:
             )
         else:
             assert first is not None
-            mesh, notes = atlas_of(first, self.frame, asset.triangle_count, options, self.reference.single)
+            mesh, notes = atlas_of(first, self.placement, asset.triangle_count, options, self.reference.single)
             self.notes += notes
             if options.relative is False and "shape" in options.fit and not options.displaced:
                 self.start = self._shaped(lambda effort: mended(self.reference, self.sampler, options, mesh, effort))
@@ -291,7 +284,7 @@ class _Job:
         )
         asset = self.parts.fitted
         name = f"{asset.name}_{len(self.start.mesh.faces)}"
-        exporter = Exporter(*self.frame, asset.origin, name)
+        exporter = Exporter(self.placement, asset.origin, name)
         initial = Model(self.start.mesh, self.start.maps, frozenset(), Rates(), self.start.levels[-1:])
         begin = exporter.drawn(initial, self.start.maps)[initial.level]
         maps = clean_maps(model, self.start.known)
@@ -310,49 +303,6 @@ class _Job:
             tessellated={k: self.parts.with_kept(a) for k, a in tessellated.items()},
             kept_triangles=self.parts.kept_triangles,
         )
-
-
-def in_frame(asset: Asset, centre: tuple[float, float, float], scale: float) -> Asset:
-    """The asset moved by -centre and divided by scale (computed in double precision). ``centre``: in
-    the world; the result has no origin of its own."""
-    offset = np.array(asset.origin) - np.array(centre)
-    moved = [
-        replace(m, positions=((m.positions.astype(np.float64) + offset) / scale).astype(np.float32))
-        for m in asset.meshes
-    ]
-    return replace(asset, meshes=tuple(moved), origin=ZERO)
-
-
-def framed(
-    points: NDArray, seed: int, light: str = "point"
-) -> tuple[tuple[tuple[float, float, float], float], ViewSampler]:
-    """(centre and radius of points (N, 3) in the world, sampler of views that are framed to them, in
-    units of that radius and around the origin)."""
-    from appearance_opt.views import ViewSampler, framing
-
-    frame = framing(points)
-    hull = support(((points - np.array(frame[0])) / frame[1]).astype(np.float32))
-    return frame, ViewSampler((0.0, 0.0, 0.0), 1.0, seed, hull=hull, light=light)
-
-
-SUPPORT_POINTS = 1 << 18
-"""Points of a cloud that are looked at in every direction. Of larger clouds these are taken evenly, and the extreme
-ones along axes and diagonals, so that what sticks out is not cut off."""
-
-
-def support(positions: NDArray, count: int = 256) -> NDArray[np.float64]:
-    """Extreme points of a cloud in ``count`` directions: enough to frame it from any side."""
-    if len(positions) > SUPPORT_POINTS:
-        axes = np.stack(np.meshgrid(*[[-1, 0, 1]] * 3), axis=-1).reshape(-1, 3).astype(positions.dtype)
-        far = np.unique([np.argmax(positions @ axis) for axis in axes])
-        positions = np.concatenate([positions[:: -(-len(positions) // SUPPORT_POINTS)], positions[far]])
-    k = np.arange(count) + 0.5
-    polar, azimuth = np.arccos(1 - 2 * k / count), np.pi * (1 + 5**0.5) * k
-    directions = np.stack(
-        [np.cos(azimuth) * np.sin(polar), np.sin(azimuth) * np.sin(polar), np.cos(polar)], axis=1
-    ).astype(np.float32)
-    best = np.concatenate([np.argmax(positions @ d.T, axis=0) for d in np.split(directions, 8)])
-    return positions[np.unique(best)].astype(np.float64)
 
 
 def fingerprint(options: SimplifyOptions, asset: Asset, first: Asset | None) -> str:

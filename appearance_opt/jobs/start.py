@@ -36,6 +36,7 @@ if TYPE_CHECKING:
 
     from appearance_opt.asset.types import Asset
     from appearance_opt.config import SimplifyOptions
+    from appearance_opt.placement import Placement
     from appearance_opt.reference.base import Reference
     from appearance_opt.views import ViewSampler
 
@@ -273,12 +274,12 @@ def sided(start: Start, single: NDArray[np.bool_]) -> Start:
 
 def atlas_of(
     given: Asset,
-    frame: tuple[tuple[float, float, float], float],
+    placement: Placement,
     available: int,
     options: SimplifyOptions,
     sides: NDArray[np.bool_],
 ) -> tuple[LatentMesh, list[str]]:
-    """(the mesh that ``options.init`` names, moved to a ``frame`` (centre, scale), with a new atlas; notes).
+    """(the mesh that ``options.init`` names, moved to a ``placement``, with a new atlas; notes).
     ``available``: triangles of the reference; ``sides``: those that are seen from their front only. If either all or
     none are, so it is with the mesh; else its file decides. Transparent parts are left out, for those of the input pass
     into the result. Raises InputError when it has more triangles than were asked for."""
@@ -294,12 +295,16 @@ def atlas_of(
     p = np.concatenate([m.positions for m in asset.meshes]).astype(np.float64)
     f = np.concatenate([m.faces + o for m, o in zip(asset.meshes, offsets, strict=True)])
     first, place = weld(p)
-    centre, scale = frame
     faces = place[f].astype(np.int32)
     require_memory(len(faces), options)
-    offset = np.array(asset.origin) - np.array(centre)
     single = single_sided(asset.meshes)
     if sides.all() or not sides.any():
         single[:] = sides.all()
-    mesh = unwrap((p[first] + offset) / scale, faces, options.texture_size, gutter(len(faces), options), single)
+    mesh = unwrap(
+        placement.relative_to(asset.origin).to_local(p[first]),
+        faces,
+        options.texture_size,
+        gutter(len(faces), options),
+        single,
+    )
     return mesh, parts.told("of --init are left out: those of the input pass into the result")

@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from appearance_opt.asset import Asset, load
 from appearance_opt.asset.types import Mesh, Texture, linear_to_srgb
 from appearance_opt.jobs.parts import split
-from appearance_opt.jobs.simplify import in_frame
+from appearance_opt.placement import Placement
 from appearance_opt.reference.mesh import MeshReference
 from appearance_opt.render.deferred import Grid
-from appearance_opt.views import Views, ViewSampler, framing
+from appearance_opt.views import Views, ViewSampler
 from experiments import mitsuba_peer
 
 SAMPLES = 64
@@ -37,8 +37,7 @@ def compare(path: Path, resolution: int = 256, normal_maps: bool = False) -> Com
     smooth tangents. Its frames are right-handed: faces with mirrored coordinates get a map with the green turned
     over."""
     asset = split(load(path), str(path), "compare").fitted  # the peer draws no transparency
-    frame = framing(asset.points())
-    asset = in_frame(asset, *frame)
+    asset = Placement.around(asset.points()).local(asset)
     if not normal_maps:
         asset = _plain(asset)
     views = ViewSampler((0.0, 0.0, 0.0), 1.0, seed=3, light="headlight").draw(0, 1)

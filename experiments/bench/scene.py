@@ -8,9 +8,9 @@ import numpy as np
 
 from appearance_opt.fit.model import Model, Rates
 from appearance_opt.initial.sphere import random_maps, sphere
-from appearance_opt.jobs.simplify import in_frame
+from appearance_opt.placement import Placement
 from appearance_opt.reference.mesh import MeshReference
-from appearance_opt.views import ViewSampler, framing
+from appearance_opt.views import ViewSampler
 from scenes.analytic import bumpy_sphere
 
 
@@ -18,8 +18,7 @@ def set_up(latent: int, reference: int, maps: int, room: float = 1.0) -> tuple[M
     """A bumpy sphere, and a smooth coarse one with random maps as its latent. ``latent``, ``reference``: triangles;
     ``room``: width of a view in units of one that the sphere fills."""
     asset = bumpy_sphere(reference)
-    frame = framing(asset.points())
-    source = MeshReference(in_frame(asset, *frame))
+    source = MeshReference(Placement.around(asset.points()).local(asset))
     mesh = sphere(latent, (0.0, 0.0, 0.0), 0.93, maps)
     model = Model(mesh, random_maps(maps, 0, True), frozenset(("shape", "normal", "material")), Rates())
     sampler = ViewSampler((0.0, 0.0, 0.0), 1.0)

@@ -21,7 +21,7 @@ from appearance_opt.jobs.start import Start, make_start
 from appearance_opt.reference.mesh import MeshReference
 from appearance_opt.reference.pool import ReferencePool
 from appearance_opt.views import VALIDATION, ViewSampler
-from experiments.common import Framed, asset
+from experiments.common import Placed, asset
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -53,9 +53,9 @@ def source(name: str) -> Path:
 
 def make_case(name: str, seed: int) -> Case:
     """The case of that name, its reference rendered. ``seed``: of views, backgrounds and random maps."""
-    framed = Framed(load(source(name)), seed)
+    placed = Placed(load(source(name)), seed)
     make = {"sphere": _from_sphere, "decimated": _decimated, "sub-pixel": _sub_pixel}[name]
-    case = make(framed.reference, framed.sampler, seed)
+    case = make(placed.reference, placed.sampler, seed)
     for group in range(case.pool.capacity // case.pool.batch):
         case.pool.draw(group)
     return case

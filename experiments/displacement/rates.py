@@ -13,7 +13,7 @@ from __future__ import annotations
 import argparse
 from functools import cache
 
-from experiments.common import OUT, Framed, Kept, source_of
+from experiments.common import OUT, Kept, Placed, source_of
 
 CASES = (
     "displacement:1,1,1",
@@ -42,8 +42,8 @@ class Bench:
         from appearance_opt.views import VALIDATION
 
         backend.select("cpu")
-        framed = Framed(load(source_of(asset)))
-        reference, sampler = framed.reference, framed.sampler
+        placed = Placed(load(source_of(asset)))
+        reference, sampler = placed.reference, placed.sampler
         options = simplify_options(triangles=TRIANGLES, displacement=True, subdivision=(LEVEL,), reallocate=0)
         self.start = make_start(reference, options, sampler, TRIANGLES)
         width = point_width(RESOLUTION, options.texture_size)

@@ -38,7 +38,7 @@ def blender_result(python: str, reference: Path, triangles: int, stem: Path) -> 
     """Blender's light mesh with its maps."""
     from appearance_opt import load, save
     from appearance_opt.asset.types import Asset
-    from appearance_opt.views import framing
+    from appearance_opt.placement import Placement
 
     low, result, maps = Path(f"{stem}_low.glb"), Path(f"{stem}_blender.glb"), Path(f"{stem}_maps")
     if result.exists():
@@ -46,7 +46,7 @@ def blender_result(python: str, reference: Path, triangles: int, stem: Path) -> 
     here = Path(__file__).parent
     command = [python, str(here / "blender_simplify.py"), str(reference), str(triangles), str(low)]
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
-    _, radius = framing(load(reference).points())
+    radius = Placement.around(load(reference).points()).scale
     bake = here.parent / "baking" / "blender_bake.py"
     command = [python, str(bake), str(reference), str(low), str(maps), str(SIZE), str(REACH * radius), "4"]
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL)

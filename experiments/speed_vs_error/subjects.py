@@ -12,17 +12,16 @@ import numpy as np
 
 from appearance_opt.asset import load
 from appearance_opt.config import as_dict, simplify_options
+from appearance_opt.evaluate.comparison import render_asset
 from appearance_opt.evaluate.metrics import compare_images
 from appearance_opt.initial.atlas import unwrap
 from appearance_opt.initial.sphere import random_maps
 from appearance_opt.jobs import growth
-from appearance_opt.jobs.compare import render_asset
 from appearance_opt.jobs.displaced import gutter
-from appearance_opt.jobs.simplify import in_frame
 from appearance_opt.jobs.start import Start, budget, make_start, transferred
 from appearance_opt.views import MEASURED
 from experiments import common
-from experiments.common import Framed, source_of
+from experiments.common import Placed, source_of
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -76,9 +75,9 @@ class Bench:
 
     def __init__(self, subject: Subject) -> None:
         self.subject, self._path = subject, subject.path()
-        framed = Framed(load(self._path))
-        self.frame, self.asset = framed.frame, framed.asset
-        self.reference, self.sampler = framed.reference, framed.sampler
+        placed = Placed(load(self._path))
+        self.placement, self.asset = placed.placement, placed.asset
+        self.reference, self.sampler = placed.reference, placed.sampler
         self._views = self.sampler.held_out(MEASURED).draw(0, VIEWS)
         self._starts: dict[int, Start] = {}
         self._measured: dict[tuple[int, bool], Metrics] = {}
@@ -107,7 +106,7 @@ class Bench:
 
     def measure_asset(self, asset: Asset) -> Metrics:
         """The same for a result as it was written, in the units of the source."""
-        return compare_images(self.images, render_asset(in_frame(asset, *self.frame), self._views, RESOLUTION, SAMPLES))
+        return compare_images(self.images, render_asset(self.placement.local(asset), self._views, RESOLUTION, SAMPLES))
 
     @cached_property
     def _camera(self):

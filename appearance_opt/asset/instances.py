@@ -12,7 +12,7 @@ from appearance_opt.asset.types import Mesh
 
 
 @dataclass(frozen=True)
-class Placement:
+class Instances:
     """Affine maps from a mesh to the world: ``matrix`` is (P, 4, 4), the places of P copies, or, if it is ``skinned``,
     (V, 4, 4) with one for each vertex of a single copy. The copies lie one after the other in what is returned."""
 
@@ -81,7 +81,7 @@ def _cofactors(m: NDArray) -> NDArray[np.float64]:
     return m[:, i, j] * m[:, k, n] - m[:, i, n] * m[:, k, j]
 
 
-def placed(mesh: Mesh, place: Placement, name: str) -> Mesh:
+def placed(mesh: Mesh, place: Instances, name: str) -> Mesh:
     """A mesh at all its places in the world, positions still in double precision."""
     vertices = len(mesh.positions)
     normals, tangents = mesh.normals, mesh.tangents
