@@ -5,7 +5,7 @@ from __future__ import annotations
 import fcntl
 import os
 import socket
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING
 
 from appearance_opt.errors import InputError
@@ -68,8 +68,9 @@ def acquire(path: Path, target: Path) -> int:
                     f"(the lock is {path})"
                 )
             if _same(handle, path):
-                os.ftruncate(handle, 0)
-                os.pwrite(handle, PREFIX + f"{os.getpid()} on {socket.gethostname()}\n".encode(), 0)
+                with suppress(OSError):  # on a full disk it holds without a word
+                    os.ftruncate(handle, 0)
+                    os.pwrite(handle, PREFIX + f"{os.getpid()} on {socket.gethostname()}\n".encode(), 0)
                 return handle
         except BaseException:
             os.close(handle)

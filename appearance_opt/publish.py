@@ -47,7 +47,7 @@ class Publication:
         if folder not in self._staged:
             folder.mkdir(parents=True, exist_ok=True)
             recover(folder)
-            self._staged[folder] = _Staged(folder)
+            self._staged[folder] = _Staged.made(folder)
         return self._staged[folder].new / final.name
 
     def commit(self) -> None:
@@ -138,24 +138,26 @@ def recover(folder: Path) -> None:
             handle = acquire(root / LOCK, root)
         except (InputError, OSError):
             continue
-        _Staged.left_behind(folder, root, handle).recover()
+        _Staged(folder, root, handle).recover()
 
 
 class _Staged:
     """The temporary folder ``root`` in ``folder``."""
 
-    def __init__(self, folder: Path, root: Path | None = None, handle: int | None = None) -> None:
-        self.folder = folder
-        self.root = Path(tempfile.mkdtemp(dir=folder, prefix=PREFIX)) if root is None else root
-        self.new, self.old, self.journal = self.root / NEW, self.root / OLD, self.root / JOURNAL
-        self._handle = acquire(self.root / LOCK, self.root) if handle is None else handle
-        if root is None:
-            self.new.mkdir()
+    def __init__(self, folder: Path, root: Path, handle: int) -> None:
+        self.folder, self.root, self._handle = folder, root, handle
+        self.new, self.old, self.journal = root / NEW, root / OLD, root / JOURNAL
 
     @classmethod
-    def left_behind(cls, folder: Path, root: Path, handle: int) -> _Staged:
-        """That of a process that is no more."""
-        return cls(folder, root, handle)
+    def made(cls, folder: Path) -> _Staged:
+        """A new one. Raises OSError, and leaves nothing behind then."""
+        root = Path(tempfile.mkdtemp(dir=folder, prefix=PREFIX))
+        try:
+            (root / NEW).mkdir()
+            return cls(folder, root, acquire(root / LOCK, root))
+        except BaseException:
+            shutil.rmtree(root, ignore_errors=True)
+            raise
 
     def moves(self) -> list[tuple[Path, Path]]:
         """(where it waits, final name) of every file."""
