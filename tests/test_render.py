@@ -15,10 +15,10 @@ from appearance_opt.initial.sphere import sphere
 from appearance_opt.latent.texels import TexelCodec
 from appearance_opt.placement import Placement
 from appearance_opt.reference.mesh import MeshReference
-from appearance_opt.render import rays, upload
+from appearance_opt.render import rays, texture, upload
 from appearance_opt.render.deferred import Grid
 from appearance_opt.render.math import angle_of
-from appearance_opt.render.texture import CLAMP, MIRROR, REPEAT, build_pyramid
+from appearance_opt.render.texture import CLAMP, MIRROR, REPEAT, Base, build_pyramid
 from appearance_opt.views import ViewSampler, look_at
 from experiments import mitsuba_peer
 from experiments.accuracy.images import compare_asset
@@ -46,7 +46,7 @@ def test_texture_lookup_interpolates_and_wraps() -> None:
         MIRROR: [(-0.125, 0.25, 0.0), (1.125, 0.25, 3.0), (1.375, 0.25, 2.0)],
     }
     for wrap, rows in cases.items():
-        pyramid = build_pyramid([texels], [wrap])
+        pyramid = build_pyramid([Base.of(texels)], [wrap])
         u, v, expected = (np.array(c, np.float32) for c in zip(*rows, strict=True))
         got = pyramid.lookup(None, mi.Point2f(u, v), mi.Float(np.zeros(len(u), np.float32)))[0]
         np.testing.assert_allclose(np.array(got), expected, atol=1e-5)
@@ -55,7 +55,7 @@ def test_texture_lookup_interpolates_and_wraps() -> None:
 def test_mip_levels_average_and_blend() -> None:
     rng = np.random.default_rng(0)
     texels = rng.random((8, 8, 2)).astype(np.float32)
-    pyramid = build_pyramid([texels], [REPEAT])
+    pyramid = build_pyramid([Base.of(texels)], [REPEAT])
     assert list(pyramid.layout.sizes[0]) == [(8, 8), (4, 4), (2, 2), (1, 1)]
     whole = pyramid.lookup(None, mi.Point2f(mi.Float([0.3]), mi.Float([0.7])), mi.Float([1.0]))[0]
     # the coarsest level is approached, not reached: lod is capped a thousandth below it
@@ -69,15 +69,32 @@ def test_textures_in_half_precision_are_off_by_its_rounding() -> None:
     rng = np.random.default_rng(3)
     texels = rng.random((32, 32, 8)).astype(np.float32)
     texels[0, 0] = 1e6
-    pyramid = build_pyramid([texels], [CLAMP])
+    exact, rounded = (build_pyramid([Base.of(texels)], [CLAMP], kind=k) for k in (np.float32, np.float16))
     uv = mi.Point2f(*rng.random((2, 1000)).astype(np.float32))
     footprint = mi.Float((10 ** rng.uniform(-4, 0, 1000)).astype(np.float32))
-    single, half = (np.array(mi.ArrayXf(p.lookup(None, uv, footprint))) for p in (pyramid, pyramid.halved()))
+    single, half = (np.array(mi.ArrayXf(p.lookup(None, uv, footprint))) for p in (exact, rounded))
     within = np.abs(single).max(axis=0) < 1
     assert within.sum() > 500
     np.testing.assert_allclose(half[:, within], single[:, within], rtol=2**-11)
-    corner = pyramid.halved().lookup(None, mi.Point2f(mi.Float([0.0]), mi.Float([0.0])), mi.Float([0.0]))
+    corner = rounded.lookup(None, mi.Point2f(mi.Float([0.0]), mi.Float([0.0])), mi.Float([0.0]))
     assert float(corner[0][0]) == 65504.0  # the largest number that there is, not infinity
+
+
+def test_pyramids_are_made_in_bands_as_in_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(5)
+    for size in ((37, 22), (1, 9), (64, 64), (1, 1), (2, 1)):
+        base = rng.random((*size, 4)).astype(np.float32)
+        levels, level = [base.reshape(-1, 4)], mi.Float(base.ravel())
+        width, height = size[1], size[0]
+        while (width, height) != (1, 1):
+            level = texture.downsample(level, (width, height), 4)
+            width, height = (width + 1) // 2, (height + 1) // 2
+            levels.append(np.array(level).reshape(-1, 4))
+        wanted = np.concatenate(levels)
+        for band in (1, 1 << 26):
+            monkeypatch.setattr(texture, "BAND_BYTES", band)
+            made = build_pyramid([Base.of(base)], [REPEAT])
+            np.testing.assert_allclose(np.array(made.texels).reshape(-1, 4), wanted, rtol=1e-6)
 
 
 def test_angles_are_those_of_the_arc_tangent() -> None:
@@ -99,7 +116,7 @@ def test_a_fitted_pyramid_is_that_of_the_decoded_values() -> None:
     codec = TexelCodec(tuple(maps), 16)
     ours = codec.layer(codec.encode(maps)).pyramid
     bounded = np.stack([maps["red"], maps["normal_x"], maps["roughness"].clip(0.08), 0 * maps["red"]], axis=-1)
-    expected = build_pyramid([bounded], [CLAMP])
+    expected = build_pyramid([Base.of(bounded)], [CLAMP])
     assert ours.layout == expected.layout
     np.testing.assert_allclose(np.array(ours.texels), np.array(expected.texels), atol=1e-6)
 

@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from appearance_opt.render.texture import CLAMP, MIRROR, REPEAT, Pyramid, build_pyramid
+from appearance_opt.render.texture import CLAMP, MIRROR, REPEAT, Base, Pyramid, build_pyramid
 
 LOOKUPS = 2000
 WRAPS = {"clamp": CLAMP, "periodic": REPEAT, "mirror": MIRROR}
@@ -26,7 +26,7 @@ def bilinear(size: tuple[int, int], wrap: str) -> float:
 
     pixels = image(size)
     uv = np.random.default_rng(1).uniform(-1, 2, (LOOKUPS, 2)).astype(np.float32)
-    ours = _lookup(build_pyramid([pixels], [WRAPS[wrap]]), uv, np.zeros(LOOKUPS, np.float32))
+    ours = _lookup(build_pyramid([Base.of(pixels)], [WRAPS[wrap]]), uv, np.zeros(LOOKUPS, np.float32))
     buffer = oiio.ImageBuf(pixels)
     theirs = np.array([buffer.interppixel_NDC(float(u), float(v), wrap) for u, v in uv])
     return float(np.abs(ours - theirs).max())
@@ -37,7 +37,7 @@ def levels(size: tuple[int, int]) -> list[float]:
     import OpenImageIO as oiio
 
     pixels = image(size)
-    pyramid = build_pyramid([pixels], [CLAMP])
+    pyramid = build_pyramid([Base.of(pixels)], [CLAMP])
     texels = np.array(pyramid.texels)
     return [
         float(np.abs(theirs - _level(pyramid, texels, k)).max())
@@ -57,7 +57,7 @@ def trilinear(size: tuple[int, int]) -> float:
     top = np.log2(max(size))
     lod = rng.uniform(-2, top - 0.01, LOOKUPS)
     footprint = (4.0**lod / (size[0] * size[1])).astype(np.float32)
-    ours = _lookup(build_pyramid([pixels], [CLAMP]), uv, footprint)
+    ours = _lookup(build_pyramid([Base.of(pixels)], [CLAMP]), uv, footprint)
     buffers = [oiio.ImageBuf(np.ascontiguousarray(level)) for level in _their_levels(oiio, pixels)]
     theirs = np.zeros((LOOKUPS, 4))
     for i, ((u, v), at) in enumerate(zip(uv, np.maximum(lod, 0), strict=True)):
