@@ -102,7 +102,7 @@ def test_damaged_pictures(damage: tuple, kind: str) -> None:
 def test_a_damaged_picture_prints_nothing_of_its_own(capfd: pytest.CaptureFixture) -> None:
     data = bytearray(images.encode_png(np.zeros((9, 7, 3), np.uint8)))
     data[60] ^= 255
-    with pytest.raises(InputError, match="wrong checksum"):
+    with pytest.raises(InputError, match="the image is damaged"):  # how, depends on the version of OpenImageIO
         images.decode(bytes(data), "picture")
     with pytest.raises(InputError, match="cut short"):
         images.decode(bytes(data[:30]), "picture")

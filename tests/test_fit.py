@@ -90,7 +90,7 @@ def test_a_start_is_never_made_worse(ball: Asset) -> None:
     model.set_rates(Rates(5.0, 1.0, 1.0, 1.0))  # absurd steps
     result = fit(model, pool, validation, FitOptions(steps=8))
     assert validation.psnr(model) >= start - 1e-6
-    assert result.best_step == 0
+    assert min(p.psnr for p in result.curve) < start - 1  # there was something to keep it from
 
 
 def test_resuming_goes_on_where_it_stopped(ball: Asset, tmp_path: Path, one_thread: float) -> None:
