@@ -179,6 +179,26 @@ def test_all_of_a_start_is_kept(tmp_path: Path) -> None:
     assert same(first, start) and same(second, start)
 
 
+def test_a_checkpoint_that_finds_no_room_does_not_end_the_fit(
+    ball: Asset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    write, tries = archive.write, []
+
+    def full(path: Path, *rest: object) -> None:
+        if path.name == "fit.npz":
+            tries.append(path)
+            raise OSError(28, "No space left on device", str(path))
+        write(path, *rest)
+
+    monkeypatch.setattr(archive, "write", full)
+    monkeypatch.setattr("appearance_opt.jobs.simplify.CHECKPOINT_SECONDS", 0.0)
+    result = appearance_opt.simplify(ball, None, options(), checkpoint=tmp_path / "state")
+    assert result.fit.steps == 2 and len(tries) == 3
+    assert [r.getMessage().split(": ")[1] for r in caplog.records if "fit.npz" in r.getMessage()] == [
+        "cannot be written (No space left on device); the fit goes on without"
+    ]
+
+
 def test_meshes_hash_alike_whether_shared_or_copied() -> None:
     p, f = np.zeros((3, 3), np.float32), np.zeros((1, 3), np.int32)
     material = Material()

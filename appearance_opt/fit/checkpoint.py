@@ -125,7 +125,6 @@ class Checkpointer:
             if not self._failed:
                 log.warning("%s: cannot be written (%s); the fit goes on without", self.path, error.strerror)
             self._failed = True
-        archive.write(self.path, self.fingerprint, Kept(self.start_hash, model.values(), state))
         self._last = time.monotonic()
 
     def restore(self, model: Model, state: FitState) -> bool:
