@@ -13,14 +13,14 @@ import pytest
 from appearance_opt.asset import load, save
 from appearance_opt.asset.images import read
 from appearance_opt.asset.types import Asset, Material, Mesh, Texture
-from appearance_opt.baking import points as bake_points
+from appearance_opt.baking import texel_points
 from appearance_opt.baking.align import align
 from appearance_opt.baking.check import overlap
 from appearance_opt.baking.closed_form import BakedMaps, Settings
 from appearance_opt.baking.closed_form import bake as closed_form
 from appearance_opt.baking.curvature import mean_curvature
-from appearance_opt.baking.low import prepare, unwrapped
-from appearance_opt.baking.points import TexelPoints
+from appearance_opt.baking.target_mesh import prepare, unwrapped
+from appearance_opt.baking.texel_points import TexelPoints
 from appearance_opt.config import bake_options, read_toml
 from appearance_opt.errors import InputError
 from appearance_opt.evaluate.metrics import compare_images
@@ -204,7 +204,7 @@ def test_maps_that_are_not_asked_for_stay(tmp_path: Path, ball: Asset) -> None:
 
 def test_bands_and_one_piece_agree(ball: Asset, low_sphere: Asset, monkeypatch: pytest.MonkeyPatch) -> None:
     whole, _ = baked_pair(ball, low_sphere, "material", "ao", samples=2, ao_rays=4)
-    monkeypatch.setattr(bake_points, "BAND", SIZE * 24)  # 24 does not divide 64
+    monkeypatch.setattr(texel_points, "BAND", SIZE * 24)  # 24 does not divide 64
     banded, _ = baked_pair(ball, low_sphere, "material", "ao", samples=2, ao_rays=4)
     np.testing.assert_array_equal(whole.covered, banded.covered)
     for name in ("red", "roughness"):

@@ -15,7 +15,7 @@ from appearance_opt.asset.creases import shaded, smooth_by_angle, split
 from appearance_opt.asset.edges import Edges
 from appearance_opt.asset.normals import unit, vertex_normals
 from appearance_opt.asset.types import Asset, Mesh, srgb_to_linear
-from appearance_opt.baking.low import movable, unwrapped
+from appearance_opt.baking.target_mesh import movable, unwrapped
 from appearance_opt.errors import InputError
 from appearance_opt.initial.decimate import decimate
 from appearance_opt.jobs.simplify import loaded

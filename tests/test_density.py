@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from appearance_opt.baking.points import TexelPoints, texel_coverage
+from appearance_opt.baking.texel_points import TexelPoints, texel_coverage
 from appearance_opt.initial.atlas import charted, charts_of, packed, unwrap, uv_areas
 from appearance_opt.initial.density import LARGEST, SMALLEST, chart_scales, halved
 from appearance_opt.initial.sphere import sphere

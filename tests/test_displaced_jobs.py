@@ -15,7 +15,7 @@ from appearance_opt.asset import load, save
 from appearance_opt.asset.height import heights_of
 from appearance_opt.asset.types import Asset, Displacement, Texture
 from appearance_opt.asset.validate import validate
-from appearance_opt.baking.low import movable, prepare
+from appearance_opt.baking.target_mesh import movable, prepare
 from appearance_opt.config import bake_options, simplify_options
 from appearance_opt.errors import InputError
 from appearance_opt.fit import loop

@@ -9,7 +9,7 @@ import pytest
 from scipy.ndimage import distance_transform_edt
 
 from appearance_opt.asset.normals import weld
-from appearance_opt.baking.points import texel_coverage
+from appearance_opt.baking.texel_points import texel_coverage
 from appearance_opt.fit.losses import LOSSES
 from appearance_opt.fit.model import POSITIONS, TEXELS, Model, Rates
 from appearance_opt.fit.step import Gradients, StepInputs

@@ -8,7 +8,7 @@ import trimesh
 
 from appearance_opt.asset.normals import weld
 from appearance_opt.asset.types import Asset, Material, Mesh
-from appearance_opt.baking.points import TexelPoints, texel_coverage
+from appearance_opt.baking.texel_points import TexelPoints, texel_coverage
 from appearance_opt.evaluate.metrics import compare_images
 from appearance_opt.initial.atlas import unwrap
 from appearance_opt.initial.decimate import decimate

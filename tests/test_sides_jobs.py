@@ -14,7 +14,7 @@ from test_sides import ball, sheet
 from appearance_opt import simplify, simplify_options
 from appearance_opt.asset import load, save
 from appearance_opt.asset.types import Asset, Material, Mesh, Texture
-from appearance_opt.baking.low import movable
+from appearance_opt.baking.target_mesh import movable
 from appearance_opt.initial.atlas import charted, charts_of, unwrap
 from appearance_opt.initial.decimate import decimate_with_source
 from appearance_opt.initial.sheets import separated

@@ -16,8 +16,8 @@ import numpy as np
 from appearance_opt.asset.packing import EMISSION
 from appearance_opt.baking.curvature import mean_curvature
 from appearance_opt.baking.occlusion import exposed, openness
-from appearance_opt.baking.points import Points, TexelPoints, interpolate_packets
-from appearance_opt.baking.search import Found, Pick, automatic_reach, find
+from appearance_opt.baking.surface_search import Found, Pick, automatic_reach, find
+from appearance_opt.baking.texel_points import Points, TexelPoints, interpolate_packets
 from appearance_opt.initial.fill import fill
 from appearance_opt.render import upload
 from appearance_opt.render.rays import sub_pixel_offsets

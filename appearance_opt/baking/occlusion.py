@@ -12,7 +12,7 @@ from appearance_opt.render.passing import blocked
 from appearance_opt.render.rays import sub_pixel_offsets
 
 if TYPE_CHECKING:
-    from appearance_opt.baking.search import Found
+    from appearance_opt.baking.surface_search import Found
     from appearance_opt.reference.mesh import MeshReference
     from appearance_opt.render.passing import Scene
 

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
     from appearance_opt.asset.types import Asset
     from appearance_opt.baking.closed_form import BakedMaps
-    from appearance_opt.baking.low import Low
+    from appearance_opt.baking.target_mesh import Low
     from appearance_opt.config import BakeOptions
     from appearance_opt.fit.loop import FitResult, Progress
     from appearance_opt.jobs.fitting import Stopwatch
@@ -162,7 +162,7 @@ class BakeJob:
         interrupts: Interrupts,
     ) -> None:
         from appearance_opt.baking import check
-        from appearance_opt.baking.low import prepare, unwrapped
+        from appearance_opt.baking.target_mesh import prepare, unwrapped
         from appearance_opt.reference.mesh import MeshReference
         from appearance_opt.views import views_around
 
@@ -313,7 +313,7 @@ class BakeJob:
 
     def _result(self, maps: dict[str, NDArray]) -> Asset:
         from appearance_opt.baking.encode import material_change
-        from appearance_opt.baking.low import with_material
+        from appearance_opt.baking.target_mesh import with_material
 
         change = material_change(self._in_metres(maps), self.options, self.reference.unlit)
         asset = with_material(self.low.asset, change)

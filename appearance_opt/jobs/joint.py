@@ -90,7 +90,7 @@ def _joined(
 
 def _fitted(job: BakeJob, options: BakeOptions, progress: Progress | None, with_report: bool) -> SimplifyResult:
     from appearance_opt.baking.closed_form import Settings, bake
-    from appearance_opt.baking.low import movable
+    from appearance_opt.baking.target_mesh import movable
     from appearance_opt.fit.model import Model, Rates
     from appearance_opt.initial.transfer import transfer_emission
     from appearance_opt.jobs.displaced import Exporter, displaced

@@ -107,8 +107,8 @@ def angles(baked: Path, theirs: np.ndarray) -> dict:
     normal in Blender's map points out of LOW ("outward"). The others show the back of a triangle of HIGH, where
     Blender's ray, unlike ours, stops: no light reaches them."""
     from appearance_opt import load
-    from appearance_opt.baking.low import prepare
-    from appearance_opt.baking.points import texel_coverage
+    from appearance_opt.baking.target_mesh import prepare
+    from appearance_opt.baking.texel_points import texel_coverage
 
     asset = load(baked)
     covered = texel_coverage(prepare(asset).mesh, SIZE)
