@@ -15,7 +15,7 @@ from appearance_opt.fit.model import POSITIONS, Model, Rates
 from appearance_opt.fit.step import Gradients
 from appearance_opt.initial.sphere import sphere
 from appearance_opt.latent.latent import LatentMesh
-from appearance_opt.render import deferred, gradient, walk
+from appearance_opt.render import deferred, gradient, silhouette_walk
 from appearance_opt.render.deferred import Grid
 from appearance_opt.render.gradient import Frame, Quality
 from appearance_opt.render.silhouette import edge_list, walkable
@@ -94,9 +94,10 @@ def test_the_gradient_is_that_of_the_blended_image(samples: int, balls: int, mon
     def image() -> np.ndarray:
         frame, _, _ = drawn(model, views, grid, quality)
         assert frame.edges is not None and frame.averaged is not None
-        assert (frame.meetings is None) == (balls == 1)
-        meeting = [] if frame.meetings is None else [frame.meetings.pixel, frame.meetings.inside.triangle]
-        seen = (frame.edges.edge, frame.edges.pixel, frame.averaged.pixel, *meeting)
+        assert (frame.intersections is None) == (balls == 1)
+        curve = frame.intersections
+        crossing = [] if curve is None else [curve.pixel, curve.inside.triangle]
+        seen = (frame.edges.edge, frame.edges.pixel, frame.averaged.pixel, *crossing)
         met.append([np.array(a).tobytes() for a in seen])
         return np.array(frame.image).reshape(-1, 4)
 
@@ -134,7 +135,7 @@ def test_a_walk_finds_silhouettes_beyond_the_triangle_that_is_seen(monkeypatch: 
     """Why we walk: without, fine meshes lose most of their outline."""
     model, grid, views = white(ball(0)), Grid(2, 64), SAMPLER.draw(1, 2)
     every, _, _ = drawn(model, views, grid, PAIRS)
-    monkeypatch.setattr(walk, "LONGEST", 1)
+    monkeypatch.setattr(silhouette_walk, "LONGEST", 1)
     near, _, _ = drawn(model, views, grid, PAIRS)
     assert every.edges is not None and near.edges is not None
     assert dr.width(near.edges.edge) < 0.5 * dr.width(every.edges.edge)
@@ -183,7 +184,7 @@ def test_surfaces_that_run_into_each_other_move_their_meeting_curve() -> None:
     ours = Ours(problem, target, "log-srgb-l1")
     error = {}
     edges = Quality(8.0, 16, 4)
-    qualities = {"pairs": replace(PAIRS, samples=4), "edges": edges, "both": replace(edges, meetings=True)}
+    qualities = {"pairs": replace(PAIRS, samples=4), "edges": edges, "both": replace(edges, intersections=True)}
     for name, quality in qualities.items():
         g = ours(quality, 0)
         error[name] = error_of(np.einsum("vc,nvc->n", g, fields)[None], truth).relative

@@ -22,15 +22,15 @@ from typing import TYPE_CHECKING
 import drjit as dr
 import mitsuba as mi
 
-from appearance_opt.render import coverage, meetings, pairs, rays, silhouette
+from appearance_opt.render import coverage, intersections, pairs, rays, silhouette
 from appearance_opt.render.deferred import Grid, pixel_index, shade, visible
 from appearance_opt.render.freezing import traced
+from appearance_opt.render.intersections import Intersections
 from appearance_opt.render.material import MaterialMaps
-from appearance_opt.render.meetings import Meetings
+from appearance_opt.render.ray_lists import Weighted, Whole, concat, joined
 from appearance_opt.render.rays import MISS, Samples
 from appearance_opt.render.silhouette import EdgeList, EdgeSamples
 from appearance_opt.render.surface import Surface
-from appearance_opt.render.weighted import Weighted, Whole, concat, joined
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -53,7 +53,7 @@ class Quality:
     ``edge_density``: silhouette points per pixel of silhouette (0: none); ``edge_samples``: camera rays in each
     pixel that a silhouette crosses; both for "edges" only. ``samples``: rays in all (other) pixels; for "pairs" a
     square number, as neighbours are compared on a regular grid. ``sample_width``, ``point_width``: texture filter
-    in pixels of a pixel that is averaged, and of one that is a single point. ``meetings``: "edges" follow surfaces
+    in pixels of a pixel that is averaged, and of one that is a single point. ``intersections``: "edges" follow surfaces
     that run into each other, too, as pairs always do, by comparing neighbouring rays (price: docs/accuracy.md).
     """
 
@@ -63,7 +63,7 @@ class Quality:
     sample_width: float = 1.0
     point_width: float = 0.4
     visibility: str = "edges"
-    meetings: bool = False
+    intersections: bool = False
 
     def __post_init__(self) -> None:
         if self.visibility not in VISIBILITY:
@@ -74,7 +74,7 @@ class Quality:
     @property
     def walks(self) -> bool:
         """Are edge lists needed that can be walked over (``silhouette.walkable``)?"""
-        return self.visibility == "pairs" or self.meetings
+        return self.visibility == "pairs" or self.intersections
 
 
 @dataclass
@@ -85,8 +85,8 @@ class Frame:
     ``averaged``: the covered camera rays that are averaged in it; ``deferred``: those that are not in the image
     yet, all of their pixels; None without any. ``crossed``: indices of the pixels that a silhouette
     crosses; ``edges``: its visible points, None without any; ``contrast``: c_in - c_out at them, premultiplied RGB
-    and coverage. ``meetings``, ``meetings_contrast``: the same where surfaces run into each other, None unless pairs
-    or ``Quality.meetings`` look for that.
+    and coverage. ``intersections``, ``intersections_contrast``: the same where surfaces run into
+    each other, None unless pairs or ``Quality.intersections`` look for that.
     """
 
     grid: Grid
@@ -97,8 +97,8 @@ class Frame:
     crossed: mi.UInt32 | None
     edges: EdgeSamples | None
     contrast: mi.ArrayXf | None
-    meetings: Meetings | None = None
-    meetings_contrast: mi.ArrayXf | None = None
+    intersections: Intersections | None = None
+    intersections_contrast: mi.ArrayXf | None = None
 
     def complete(self) -> mi.Bool | None:
         """(pixels,) which pixels of the image are not deferred; None if none is."""
@@ -129,15 +129,15 @@ def render(
         if quality.visibility == "pairs" and edge_list is not None:
             found = pairs.paired_samples(scene, edge_list, surface.vertices, records, grid, quality, defer, run)
             averaged, deferred, crossed = found.averaged, found.deferred, found.crossed
-            edges, met, filtered = found.edges, found.meetings, quality.sample_width / isqrt(quality.samples)
+            edges, met, filtered = found.edges, found.intersections, quality.sample_width / isqrt(quality.samples)
         else:
             if quality.visibility == "edges" and edge_list is not None and quality.edge_density > 0:
                 edges = silhouette.sample_edges(
                     scene, edge_list, surface.vertices, records, grid, quality.edge_density, seed, run
                 )
-                if quality.meetings:
+                if quality.intersections:
                     per_axis = isqrt(quality.samples)
-                    met = pairs.meeting_points(scene, edge_list, surface.vertices, records, grid, per_axis, run)
+                    met = pairs.find_intersections(scene, edge_list, surface.vertices, records, grid, per_axis, run)
             crossing = [b.pixel for b in (edges, met) if b is not None]
             averaged, deferred, crossed = _camera_samples(scene, surface, records, grid, crossing, quality, defer, run)
         width = dr.opaque(mi.Float, filtered)
@@ -159,7 +159,7 @@ def _averages(
     pixels: int,
     averaged: Weighted | None,
     edges: EdgeSamples | None,
-    met: Meetings | None,
+    met: Intersections | None,
     width: mi.Float,
     corrected: int | None,
 ) -> tuple[mi.Float, mi.ArrayXf | None, mi.ArrayXf | None]:
@@ -213,9 +213,11 @@ def surrogate(
     if frame.edges is not None:
         jump = _jump(image_gradient, frame.edges.pixel, frame.contrast)
         terms.append(jump * frame.edges.length * silhouette.motion(*moving, frame.edges, frame.grid.size))
-    if frame.meetings is not None:
-        jump = _jump(image_gradient, frame.meetings.pixel, frame.meetings_contrast)
-        terms.append(jump * frame.meetings.area * meetings.motion(*moving, frame.meetings, frame.grid.size))
+    if frame.intersections is not None:
+        jump = _jump(image_gradient, frame.intersections.pixel, frame.intersections_contrast)
+        terms.append(
+            jump * frame.intersections.area * intersections.motion(*moving, frame.intersections, frame.grid.size)
+        )
     return terms
 
 

@@ -14,9 +14,9 @@ image, to rounding.
 
 Two things go beyond the paper. We do not stop at the triangle that the front sample sees but walk on over the mesh to
 the silhouette (``walk``), since triangles beside an outline are seen edge-on and thinner than a pixel. And where two
-sheets both cover both samples they run into each other, which is a boundary without an edge (``meetings``). What lies
-between the samples without being seen by one of them is missed still: the gradient is too short where parts are thinner
-than the samples' distance.
+sheets both cover both samples they run into each other, which is a boundary without an edge
+(``intersections``). What lies between the samples without being seen by one of them is missed
+still: the gradient is too short where parts are thinner than the samples' distance.
 """
 
 from __future__ import annotations
@@ -28,15 +28,15 @@ from typing import TYPE_CHECKING
 import drjit as dr
 import mitsuba as mi
 
-from appearance_opt.render import meetings, rays, silhouette
+from appearance_opt.render import intersections, rays, silhouette
 from appearance_opt.render.deferred import Grid, pixel_index
 from appearance_opt.render.freezing import traced
+from appearance_opt.render.intersections import Intersections
 from appearance_opt.render.math import clamp
-from appearance_opt.render.meetings import Meetings
+from appearance_opt.render.ray_lists import Weighted, Whole, concat, joined
 from appearance_opt.render.rays import MISS, Samples
 from appearance_opt.render.silhouette import EdgeList, EdgeSamples
-from appearance_opt.render.walk import Neighbours, choose, neighbours, walk
-from appearance_opt.render.weighted import Weighted, Whole, concat, joined
+from appearance_opt.render.silhouette_walk import Neighbours, choose, neighbours, walk
 
 if TYPE_CHECKING:
     from appearance_opt.render.freezing import Run
@@ -46,12 +46,12 @@ if TYPE_CHECKING:
 
 @dataclass
 class Pairs:
-    """What pairs do to a batch. ``edges``, ``meetings``: the boundaries, ``inside`` the front samples and ``pixel``
-    the pixel that changes. Of all of them: ``receiver``, the index of the sample in that pixel; ``pixel``; ``giver``,
-    the other sample; ``weight``, its share in [0, 1/2]."""
+    """What pairs do to a batch. ``edges``, ``intersections``: the boundaries, ``inside`` the front
+    samples and ``pixel`` the pixel that changes. Of all of them: ``receiver``, the index of the
+    sample in that pixel; ``pixel``; ``giver``, the other sample; ``weight``, its share in [0, 1/2]."""
 
     edges: EdgeSamples | None
-    meetings: Meetings | None
+    intersections: Intersections | None
     receiver: mi.UInt32
     pixel: mi.UInt32
     giver: Samples
@@ -67,7 +67,7 @@ class Paired:
     deferred: Whole | None
     crossed: mi.UInt32 | None
     edges: EdgeSamples | None = None
-    meetings: Meetings | None = None
+    intersections: Intersections | None = None
 
 
 @dataclass
@@ -114,10 +114,10 @@ def paired_samples(
     dr.eval(found.pixel)
     changed = dr.zeros(mi.Bool, grid.pixels)
     dr.scatter(changed, mi.Bool(True), found.pixel)
-    return Paired(averaged, deferred, dr.compress(changed), found.edges, found.meetings)
+    return Paired(averaged, deferred, dr.compress(changed), found.edges, found.intersections)
 
 
-def meeting_points(
+def find_intersections(
     scene: Scene,
     edges: EdgeList,
     vertices: mi.Float,
@@ -125,7 +125,7 @@ def meeting_points(
     grid: Grid,
     per_axis: int,
     run: Run = traced,
-) -> Meetings | None:
+) -> Intersections | None:
     """Where surfaces run into each other, found between ``per_axis`` squared rays in every pixel, and nothing else of
     what pairs find: for other estimators of the derivative at silhouettes. None without any."""
     fine = _Fine(grid.finer(per_axis), grid, per_axis)
@@ -133,7 +133,7 @@ def meeting_points(
     hits, depth = run(_middles, scene, records, s.view, s.column, s.row, s.size)
     dr.eval(hits, depth)
     found = find_pairs(edges, vertices, records, hits, depth, fine, run)
-    return None if found is None else found.meetings
+    return None if found is None else found.intersections
 
 
 def _middles(
@@ -204,7 +204,7 @@ def find_pairs(
         outlines.append((other.keep(kept), dr.gather(mi.UInt32, edge, kept)))
         kept = dr.compress((returns != MISS) & (returns != other.back.triangle))
         if dr.width(kept):
-            met = meetings.find(edges, vertices, records, other.keep(kept).swapped(), size)
+            met = intersections.find(edges, vertices, records, other.keep(kept).swapped(), size)
     parts: list[tuple] = []
     points = None
     outlines = [o for o in outlines if o[0].width]

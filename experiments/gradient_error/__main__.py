@@ -44,11 +44,11 @@ SETTINGS = {
     "edges 1, 8 rays (default)": Quality(),
     "edges 2, 4 rays": Quality(2.0, 4, 1),
     "edges 4, 8 rays": Quality(4.0, 8, 1),
-    "edges 4, 8 rays, meetings": Quality(4.0, 8, 1, meetings=True),
+    "edges 4, 8 rays, intersections": Quality(4.0, 8, 1, intersections=True),
     "edges 8, 16 rays, 2": Quality(8.0, 16, 2),
-    "edges 8, 16 rays, 2, meetings": Quality(8.0, 16, 2, meetings=True),
+    "edges 8, 16 rays, 2, intersections": Quality(8.0, 16, 2, intersections=True),
     "edges 8, 16 rays, 2 x 2": Quality(8.0, 16, 4),
-    "edges 8, 16 rays, 2 x 2, meetings": Quality(8.0, 16, 4, meetings=True),
+    "edges 8, 16 rays, 2 x 2, intersections": Quality(8.0, 16, 4, intersections=True),
     "edges 16, 64 rays, 4 x 4": Quality(16.0, 64, 16),
 }
 """Edges: silhouette points per pixel of silhouette, rays per pixel that a silhouette crosses, rays in the others (one

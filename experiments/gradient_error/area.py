@@ -19,7 +19,7 @@ from appearance_opt import backend
 from appearance_opt.fit.model import POSITIONS, Model, Rates
 from appearance_opt.initial.sphere import sphere
 from appearance_opt.latent.latent import LatentMesh
-from appearance_opt.render import deferred, gradient, silhouette, walk
+from appearance_opt.render import deferred, gradient, silhouette, silhouette_walk
 from appearance_opt.render.deferred import Grid
 from appearance_opt.render.gradient import Quality
 from appearance_opt.views import ViewSampler
@@ -32,7 +32,7 @@ SETTINGS: dict[str, tuple[Quality, tuple]] = {
     "the same, side rays at 1e-3 pixels": (EDGES, (silhouette, "OFFSET", 1e-3 / RESOLUTION)),
     "the same, side rays at 1e-2 pixels": (EDGES, (silhouette, "OFFSET", 1e-2 / RESOLUTION)),
     "pairs": (PAIRS, ()),
-    "pairs without a walk": (PAIRS, (walk, "LONGEST", 1)),
+    "pairs without a walk": (PAIRS, (silhouette_walk, "LONGEST", 1)),
     "pairs, 2 x 2": (Quality(samples=4, visibility="pairs"), ()),
 }
 

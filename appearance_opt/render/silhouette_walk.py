@@ -10,9 +10,9 @@ import mitsuba as mi
 from appearance_opt.render import rays, silhouette
 from appearance_opt.render.deferred import Grid, pixel_index
 from appearance_opt.render.outlines import NOTHING
+from appearance_opt.render.ray_lists import concat, joined
 from appearance_opt.render.rays import MISS, Samples
 from appearance_opt.render.silhouette import EdgeList
-from appearance_opt.render.weighted import concat, joined
 
 LONGEST = 32
 """Triangles between a sample and where a walk ends, at most."""

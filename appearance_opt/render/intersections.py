@@ -17,7 +17,7 @@ from appearance_opt.render import rays, silhouette
 from appearance_opt.render.math import clamp
 from appearance_opt.render.rays import Samples
 from appearance_opt.render.silhouette import EdgeList
-from appearance_opt.render.walk import Neighbours
+from appearance_opt.render.silhouette_walk import Neighbours
 
 FLATTEST = 2e-5
 """Sheets whose reciprocal depths differ less, before and behind a crossing together and relative to themselves, do not
@@ -25,7 +25,7 @@ meet: this is the rounding of one sheet at the seam of two triangles, or a conta
 
 
 @dataclass
-class Meetings:
+class Intersections:
     """M places where one sheet passes through another between two samples, ``inside`` and ``outside``.
 
     ``horizontal``: are they beside each other? ``position``: of the crossing, from the inside sample in units of their
@@ -46,7 +46,7 @@ def find(
     records: mi.Float,
     pairs: Neighbours,
     resolution: mi.Float,
-) -> Meetings | None:
+) -> Intersections | None:
     """The crossings between samples whose sheets go on under each other. None without any. ``area`` and ``pixel``
     are left to the caller."""
     front, back = pairs.front, pairs.back
@@ -62,10 +62,12 @@ def find(
         return None
     p = pairs.keep(kept)
     position = clamp(dr.gather(mi.Float, first / (first - last), kept), 0, 1)
-    return Meetings(p.front, p.back, p.horizontal, position, mi.Float(1), mi.UInt32(0))
+    return Intersections(p.front, p.back, p.horizontal, position, mi.Float(1), mi.UInt32(0))
 
 
-def motion(edges: EdgeList, vertices: mi.Float, records: mi.Float, found: Meetings, resolution: mi.Float) -> mi.Float:
+def motion(
+    edges: EdgeList, vertices: mi.Float, records: mi.Float, found: Intersections, resolution: mi.Float
+) -> mi.Float:
     """Position of each crossing in units of the samples' distance, differentiable in ``vertices``."""
     camera = rays.camera_of(records, found.inside.view)
     first, last = _differences(edges, vertices, camera, found.inside, found.outside, resolution)
