@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 import re
 import subprocess
 import sys
@@ -63,33 +62,6 @@ def test_files_and_functions_that_pages_name_are_there(name: str) -> None:
             code = places[0].read_text(encoding="utf-8")
             last = function.split(".")[-1]
             assert re.search(rf"^\s*(?:def|class) {last}\b|^{last}\b", code, re.M), f"{path}: {function}"
-
-
-FLOORS = (
-    {"asset", "publish", "lock", "digest", "interrupts", "memory", "errors", "config"},
-    {"views", "backend"},
-    {"render"},
-    {"latent", "reference", "initial", "baking"},
-    {"fit"},
-    {"evaluate"},
-    {"jobs"},
-    {"cli", "progress", "doctor", "__main__"},
-)
-"""What docs/design.md draws, from below."""
-
-
-def test_no_floor_imports_from_above() -> None:
-    floor = {name: k for k, names in enumerate(FLOORS) for name in names}
-    package = ROOT / "appearance_opt"
-    for path in package.rglob("*.py"):
-        own = path.relative_to(package).parts[0].removesuffix(".py")
-        if own == "__init__":  # the public names
-            continue
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("appearance_opt"):
-                _, *below = str(node.module).split(".")
-                for name in below[:1] or [a.name for a in node.names if a.name in floor]:
-                    assert floor[name] <= floor[own], f"{path.relative_to(ROOT)} imports {name}"
 
 
 def test_lines_of_pages_are_short() -> None:
