@@ -103,15 +103,8 @@ def _baked(
     interrupts: Interrupts,
 ) -> BakeResult:
     from appearance_opt.jobs.fitting import conclude
-    from appearance_opt.jobs.simplify import loaded
 
-    watch.begin("reading both meshes")
-    heavy, light = loaded(high, options, variants), loaded_low(low, options)
-    outputs.check_inputs(heavy, light)
-    outputs.check_room(light.triangle_count, options)
-    watch.lap("load")
-    watch.begin(f"preparing {heavy.triangle_count:,} and {light.triangle_count:,} triangles")
-    run = BakeJob(*split_pair(high, heavy, low, light), options, watch, interrupts)
+    run = BakeJob(*read_pair(high, low, outputs, options, variants, watch), options, watch, interrupts)
     result, error = run.run(progress, outputs.report is not None)
     if outputs.out is not None:
         with publication() as together:
@@ -132,10 +125,24 @@ def _baked(
     return result
 
 
-def split_pair(
-    high: str | Path | Asset, heavy: Asset, low: str | Path | Asset, light: Asset
+def read_pair(
+    high: str | Path | Asset,
+    low: str | Path | Asset,
+    outputs: Outputs,
+    options: BakeOptions,
+    variants: dict[str, str] | None,
+    watch: Stopwatch,
 ) -> tuple[Parts, Parts, str]:
-    """(what of HIGH is baked, what of LOW is baked onto, what to call LOW). Raises InputError if it is nothing."""
+    """(what of HIGH is baked, what of LOW is baked onto, what to call LOW). Raises InputError if it is nothing, or if
+    the outputs would replace a file of either."""
+    from appearance_opt.jobs.simplify import loaded
+
+    watch.begin("reading both meshes")
+    heavy, light = loaded(high, options, variants), loaded_low(low, options)
+    outputs.check_inputs(heavy, light)
+    outputs.check_room(light.triangle_count, options)
+    watch.lap("load")
+    watch.begin(f"preparing {heavy.triangle_count:,} and {light.triangle_count:,} triangles")
     names = [str(a) if isinstance(a, (str, Path)) else a.name for a in (high, low)]
     return split(heavy, f"HIGH, {names[0]}", "bake"), split(light, f"LOW, {names[1]}", "bake onto", False), names[1]
 

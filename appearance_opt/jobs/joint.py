@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from appearance_opt.interrupts import Interrupts
 from appearance_opt.jobs.paths import Outputs
-from appearance_opt.jobs.simplify import SimplifyResult, loaded, write_result
+from appearance_opt.jobs.simplify import SimplifyResult, write_result
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -58,17 +58,12 @@ def _joined(
     watch: Stopwatch,
     interrupts: Interrupts,
 ) -> SimplifyResult:
-    from appearance_opt.jobs.bake import BakeJob, loaded_low, split_pair
+    from appearance_opt.jobs.bake import BakeJob, read_pair
     from appearance_opt.jobs.displaced import require_memory
     from appearance_opt.jobs.fitting import conclude
 
-    watch.begin("reading both meshes")
-    heavy, light = loaded(high, options, variants), loaded_low(low, options)
-    outputs.check_inputs(heavy, light)
-    outputs.check_room(light.triangle_count, options)
-    parts = split_pair(high, heavy, low, light)
+    parts = read_pair(high, low, outputs, options, variants, watch)
     require_memory(parts[1].fitted.triangle_count, options)
-    watch.lap("load")
     job = BakeJob(*parts, options, watch, interrupts)
     result = _fitted(job, options, progress, outputs.report is not None)
     if outputs.out is not None:
