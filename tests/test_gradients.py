@@ -120,10 +120,10 @@ def coverage_derivative(density: float, samples: int) -> tuple[float, float]:
     surface = model.surface(positions)
     maps = model.maps(model.fitted_layer())
     quality = Quality(density, samples, 1)
-    frame = gradient.render(model.scene, surface, maps, model.topology.edges, records, grid, quality, 0)
+    batch = gradient.render(model.scene, surface, maps, model.topology.edges, records, grid, quality, 0)
     by_image = np.zeros((grid.pixels, 4), np.float32)
     by_image[:, 3] = 1
-    gradient.backward(gradient.surrogate(frame, surface, maps, model.topology.edges, mi.Float(by_image.ravel())))
+    gradient.backward(gradient.surrogate(batch, surface, maps, model.topology.edges, mi.Float(by_image.ravel())))
     edge = float(np.array(dr.grad(positions)).astype(np.float64) @ start)
     areas = []
     for scale in (1.02, 0.98):
@@ -287,12 +287,12 @@ def test_pixels_shaded_with_their_loss_have_the_gradient_of_the_whole_image(
     shape, layer = model.track(model.shape(), layer)
     surface = model.surface(model.drawn.pose(shape))
     maps, edges = model.maps(layer), model.topology.edges
-    frame = gradient.render(model.scene, surface, maps, edges, records, grid, quality, inputs.seed)
-    assert frame.deferred is None
+    batch = gradient.render(model.scene, surface, maps, edges, records, grid, quality, inputs.seed)
+    assert batch.deferred is None
     target = Target.of(inputs.reference.average, inputs.background)
-    pixels = compared_pixels(frame.image, target)
-    whole, by_image = image_loss(loss, target, frame.image, pixels, grid.pixels)
-    gradient.backward(gradient.surrogate(frame, surface, maps, edges, by_image))
+    pixels = compared_pixels(batch.image, target)
+    whole, by_image = image_loss(loss, target, batch.image, pixels, grid.pixels)
+    gradient.backward(gradient.surrogate(batch, surface, maps, edges, by_image))
     slow = model.gradients(shape, layer, model.values())
     assert (value is not None) == want_loss
     if value is not None:

@@ -17,7 +17,7 @@ from appearance_opt.initial.sphere import sphere
 from appearance_opt.latent.latent import LatentMesh
 from appearance_opt.render import deferred, gradient, silhouette_walk
 from appearance_opt.render.deferred import Grid
-from appearance_opt.render.gradient import Frame, Quality
+from appearance_opt.render.gradient import Quality, RenderedBatch
 from appearance_opt.render.silhouette import edge_list, walkable
 from appearance_opt.render.surface import Surface
 from appearance_opt.views import Views, ViewSampler
@@ -44,21 +44,23 @@ def two_balls() -> LatentMesh:
     return LatentMesh(p, f, np.arange(len(p), dtype=np.int32), f, np.zeros((len(p), 2), np.float32))
 
 
-def drawn(model: Model, views: Views, grid: Grid, quality: Quality) -> tuple[Frame, Surface, mi.Float]:
-    """(frame, surface, positions that track gradients)."""
+def drawn(model: Model, views: Views, grid: Grid, quality: Quality) -> tuple[RenderedBatch, Surface, mi.Float]:
+    """(batch, surface, positions that track gradients)."""
     positions = mi.Float(np.array(model.positions()))
     dr.enable_grad(positions)
     surface = model.surface(positions)
     maps = model.maps(model.fitted_layer())
-    frame = gradient.render(model.scene, surface, maps, model.topology.walkable, views.records(), grid, quality, 0)
-    return frame, surface, positions
+    batch = gradient.render(model.scene, surface, maps, model.topology.walkable, views.records(), grid, quality, 0)
+    return batch, surface, positions
 
 
-def pulled(model: Model, frame: Frame, surface: Surface, positions: mi.Float, by_image: np.ndarray) -> np.ndarray:
+def pulled(
+    model: Model, batch: RenderedBatch, surface: Surface, positions: mi.Float, by_image: np.ndarray
+) -> np.ndarray:
     """dLoss/dPositions, for dLoss/dImage (pixels, 4)."""
     maps, edges = model.maps(model.fitted_layer()), model.topology.walkable
     flat = mi.Float(by_image.astype(np.float32).ravel())
-    gradient.backward(gradient.surrogate(frame, surface, maps, edges, flat))
+    gradient.backward(gradient.surrogate(batch, surface, maps, edges, flat))
     return np.array(dr.grad(positions)).reshape(-1, 3).astype(np.float64)
 
 
@@ -92,14 +94,14 @@ def test_the_gradient_is_that_of_the_blended_image(samples: int, balls: int, mon
     met: list[list[bytes]] = []
 
     def image() -> np.ndarray:
-        frame, _, _ = drawn(model, views, grid, quality)
-        assert frame.edges is not None and frame.averaged is not None
-        assert (frame.intersections is None) == (balls == 1)
-        curve = frame.intersections
+        batch, _, _ = drawn(model, views, grid, quality)
+        assert batch.edges is not None and batch.averaged is not None
+        assert (batch.intersections is None) == (balls == 1)
+        curve = batch.intersections
         crossing = [] if curve is None else [curve.pixel, curve.inside.triangle]
-        seen = (frame.edges.edge, frame.edges.pixel, frame.averaged.pixel, *crossing)
+        seen = (batch.edges.edge, batch.edges.pixel, batch.averaged.pixel, *crossing)
         met.append([np.array(a).tobytes() for a in seen])
-        return np.array(frame.image).reshape(-1, 4)
+        return np.array(batch.image).reshape(-1, 4)
 
     # where an outline passes the middle of a pixel, the image jumps by the difference between neighbours: such
     # differences are left out
@@ -117,9 +119,9 @@ def test_pairs_carry_the_derivative_of_the_covered_area(splits: int, samples: in
     model, grid, views = white(mesh), Grid(4, 64), SAMPLER.draw(1, 4)
     by = np.zeros((grid.pixels, 4))
     by[:, 3] = 1
-    frame, surface, positions = drawn(model, views, grid, replace(PAIRS, samples=samples))
+    batch, surface, positions = drawn(model, views, grid, replace(PAIRS, samples=samples))
     start = mesh.positions.astype(np.float64)
-    found = np.sum(pulled(model, frame, surface, positions, by) * start)
+    found = np.sum(pulled(model, batch, surface, positions, by) * start)
     records, maps = views.records(), model.maps(model.fitted_layer())
 
     def image() -> np.ndarray:
@@ -197,9 +199,9 @@ def test_pairs_that_see_nothing_are_no_pairs() -> None:
     mesh = sphere(100, (0.0, 0.0, 0.0), 0.5, 16)
     away = LatentMesh(mesh.positions + np.float32(100), mesh.faces, mesh.frame_vertex, mesh.frame_faces, mesh.uvs)
     model, grid = white(away), Grid(2, 32)
-    frame, _, _ = drawn(model, SAMPLER.draw(0, 2), grid, PAIRS)
-    assert frame.edges is None and frame.averaged is None
-    assert not np.array(frame.image).any()
+    batch, _, _ = drawn(model, SAMPLER.draw(0, 2), grid, PAIRS)
+    assert batch.edges is None and batch.averaged is None
+    assert not np.array(batch.image).any()
 
 
 def test_only_what_is_chosen_is_prepared() -> None:

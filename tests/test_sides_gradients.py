@@ -64,10 +64,10 @@ def test_silhouettes_carry_the_derivative_of_the_area_that_is_seen_of_fronts(
     positions = mi.Float(start)
     dr.enable_grad(positions)
     surface, maps, records = model.surface(positions), model.maps(model.fitted_layer()), views.records()
-    frame = gradient.render(model.scene, surface, maps, edges, records, grid, quality, 0)
+    batch = gradient.render(model.scene, surface, maps, edges, records, grid, quality, 0)
     by = np.zeros((grid.pixels, 4), np.float32)
     by[:, 3] = weight
-    gradient.backward(gradient.surrogate(frame, surface, maps, edges, mi.Float(by.ravel())))
+    gradient.backward(gradient.surrogate(batch, surface, maps, edges, mi.Float(by.ravel())))
     analytic = np.array(dr.grad(positions)).astype(np.float64)
     rng = np.random.default_rng(1)
     # growing, moving and turning about, and what random vertices add to it

@@ -86,17 +86,17 @@ class Gradients:
             shape, layer = run(self._unpacked, stored)
             surface = run(self._surface, model.level, shape)
         edges = self._edges[model.level]
-        frame = gradient.render(
+        batch = gradient.render(
             model.scene, surface, model.maps(layer), edges, records, grid, self.quality, inputs.seed, True, run
         )
         # Only averaged pixels have a gradient here. Of one ray per pixel these are the crossed ones; of several rays
         # also those that are covered in part without being crossed. The value of the loss needs all pixels.
-        some = frame.crossed
-        if inputs.want_loss or frame.deferred is None or self.quality.samples > 1:
-            some = compared_pixels(frame.image, target, frame.complete())
+        some = batch.crossed
+        if inputs.want_loss or batch.deferred is None or self.quality.samples > 1:
+            some = compared_pixels(batch.image, target, batch.complete())
         averaged, by_image = None, dr.zeros(mi.Float, 4 * grid.pixels)
         if some is not None and dr.width(some):
-            averaged, by_image = run(image_loss, self.loss, target, frame.image, some, grid.pixels)
+            averaged, by_image = run(image_loss, self.loss, target, batch.image, some, grid.pixels)
         # what one ray saw is compared with one ray
         points = inputs.reference.points if self.quality.samples == 1 else None
         direct, out = run(
@@ -105,7 +105,7 @@ class Gradients:
             stored,
             shape,
             layer,
-            frame,
+            batch,
             by_image,
             target if points is None else replace(target, reference=points),
             dr.opaque(mi.Float, inputs.laplacian_weight),
@@ -134,7 +134,7 @@ class Gradients:
         stored: dict[str, mi.Float],
         shape: Shape,
         layer: TexelLayer | None,
-        frame: gradient.Frame,
+        batch: gradient.RenderedBatch,
         by_image: mi.Float,
         target: Target,
         laplacian_weight: mi.Float,
@@ -149,8 +149,8 @@ class Gradients:
         def pixel_loss(color: mi.Color3f, pixel: mi.UInt32) -> mi.Float:
             return covered_loss(self.loss, target, color, pixel)
 
-        terms = gradient.surrogate(frame, surface, maps, edges, by_image)
-        direct = gradient.direct(frame, surface, maps, pixel_loss)
+        terms = gradient.surrogate(batch, surface, maps, edges, by_image)
+        direct = gradient.direct(batch, surface, maps, pixel_loss)
         if direct is not None:
             terms.append(direct)
         if dr.grad_enabled(posed) and level in self.laplacians:

@@ -78,7 +78,7 @@ class Quality:
 
 
 @dataclass
-class Frame:
+class RenderedBatch:
     """A rendered batch and what its backward pass needs.
 
     ``image``: (pixels * 4) premultiplied linear radiance and coverage, without the deferred pixels.
@@ -120,7 +120,7 @@ def render(
     seed: int,
     defer: bool = False,
     run: Run = traced,
-) -> Frame:
+) -> RenderedBatch:
     """Forward pass, without gradients (``surface`` and ``maps`` are read detached). With ``defer``, pixels of
     few samples that no silhouette crosses are not shaded but left to ``direct``. ``run``: how its stages are called
     (see ``freezing``)."""
@@ -147,7 +147,7 @@ def render(
             _averages, surface, maps, records, grid.size, grid.rows, grid.pixels, averaged, edges, met, width, corrected
         )
         dr.eval(image, contrast, met_contrast)
-    return Frame(grid, records, image, averaged, deferred, crossed, edges, contrast, met, met_contrast)
+    return RenderedBatch(grid, records, image, averaged, deferred, crossed, edges, contrast, met, met_contrast)
 
 
 def _averages(
@@ -182,41 +182,41 @@ def _averages(
 
 
 def direct(
-    frame: Frame, surface: Surface, maps: MaterialMaps, pixel_loss: Callable[[mi.Color3f, mi.UInt32], mi.Float]
+    batch: RenderedBatch, surface: Surface, maps: MaterialMaps, pixel_loss: Callable[[mi.Color3f, mi.UInt32], mi.Float]
 ) -> mi.Float | None:
     """Loss of each deferred pixel, differentiable: ``pixel_loss(radiance, pixel)`` of its radiance (all
     deferred pixels are fully covered). None without any."""
-    if frame.deferred is None:
+    if batch.deferred is None:
         return None
-    d = frame.deferred
-    colors = [shade(surface, maps, frame.records, r, frame.grid.size, d.width) for r in d.rays]
+    d = batch.deferred
+    colors = [shade(surface, maps, batch.records, r, batch.grid.size, d.width) for r in d.rays]
     return pixel_loss(sum(colors[1:], colors[0]) * (1 / len(colors)), d.pixel)
 
 
 def surrogate(
-    frame: Frame, surface: Surface, maps: MaterialMaps, edge_list: EdgeList | None, image_gradient: mi.Float
+    batch: RenderedBatch, surface: Surface, maps: MaterialMaps, edge_list: EdgeList | None, image_gradient: mi.Float
 ) -> list[mi.Float]:
     """Arrays whose sums have the loss's derivative, for ``image_gradient`` = dLoss/dImage (pixels * 4).
 
     Only their gradients mean anything: pass them to ``backward``. They are not summed here, as a sum would
-    evaluate them and make the backward pass shade once more. Empty when the frame is.
+    evaluate them and make the backward pass shade once more. Empty when the batch is.
     """
     terms = []
-    if frame.averaged is not None:
-        a = frame.averaged
-        color = shade(surface, maps, frame.records, a.samples, frame.grid.size, a.width)
+    if batch.averaged is not None:
+        a = batch.averaged
+        color = shade(surface, maps, batch.records, a.samples, batch.grid.size, a.width)
         g = _pixel(image_gradient, a.pixel)
         terms.append(dr.fma(g[0], color.x, dr.fma(g[1], color.y, g[2] * color.z)) * a.weight)
     if edge_list is None or not dr.grad_enabled(surface.vertices):
         return terms
-    moving = (edge_list, surface.vertices, frame.records)
-    if frame.edges is not None:
-        jump = _jump(image_gradient, frame.edges.pixel, frame.contrast)
-        terms.append(jump * frame.edges.length * silhouette.motion(*moving, frame.edges, frame.grid.size))
-    if frame.intersections is not None:
-        jump = _jump(image_gradient, frame.intersections.pixel, frame.intersections_contrast)
+    moving = (edge_list, surface.vertices, batch.records)
+    if batch.edges is not None:
+        jump = _jump(image_gradient, batch.edges.pixel, batch.contrast)
+        terms.append(jump * batch.edges.length * silhouette.motion(*moving, batch.edges, batch.grid.size))
+    if batch.intersections is not None:
+        jump = _jump(image_gradient, batch.intersections.pixel, batch.intersections_contrast)
         terms.append(
-            jump * frame.intersections.area * intersections.motion(*moving, frame.intersections, frame.grid.size)
+            jump * batch.intersections.area * intersections.motion(*moving, batch.intersections, batch.grid.size)
         )
     return terms
 

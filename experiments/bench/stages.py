@@ -84,28 +84,28 @@ def stages(resolution: int, maps: int) -> dict[str, float]:
     loss, target = LOSSES["log-srgb-l1"], Target.of(reference, np.full((4, 3), 0.3))
     run = Frozen(model.fixed(), grid)
 
-    def forward(quality: Quality) -> gradient.Frame:
+    def forward(quality: Quality) -> gradient.RenderedBatch:
         return gradient.render(scene, surface, all_maps, edges, records, grid, quality, 0, True, run)
 
     timed("visibility alone", lambda: forward(Quality(0.0, 1, 1)).image)
     timed("visibility, silhouettes, averaged pixels", lambda: forward(quality).image)
-    frame = forward(quality)
+    batch = forward(quality)
 
     def averaged() -> tuple:
-        pixels = compared_pixels(frame.image, target, frame.complete())
-        return run(image_loss, loss, target, frame.image, pixels, grid.pixels)
+        pixels = compared_pixels(batch.image, target, batch.complete())
+        return run(image_loss, loss, target, batch.image, pixels, grid.pixels)
 
     timed("loss of averaged pixels", averaged)
     _, by_image = averaged()
 
     def backward() -> tuple:
-        return run(pulled_back, frame, model.shape(), layer, by_image)
+        return run(pulled_back, batch, model.shape(), layer, by_image)
 
-    def pulled_back(frame: gradient.Frame, shape: Shape, layer: TexelLayer, by_image: mi.Float) -> tuple:
+    def pulled_back(batch: gradient.RenderedBatch, shape: Shape, layer: TexelLayer, by_image: mi.Float) -> tuple:
         shape, layer = model.track(shape, layer)
         fresh, moving = model.maps(layer), model.surface(shape.positions)
-        terms = gradient.surrogate(frame, moving, fresh, edges, by_image)
-        direct = gradient.direct(frame, moving, fresh, lambda c, pixel: covered_loss(loss, target, c, pixel))
+        terms = gradient.surrogate(batch, moving, fresh, edges, by_image)
+        direct = gradient.direct(batch, moving, fresh, lambda c, pixel: covered_loss(loss, target, c, pixel))
         gradient.backward([*terms, direct])
         return dr.grad(shape.positions), dr.grad(layer.pyramid.texels)
 

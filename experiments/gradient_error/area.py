@@ -54,10 +54,10 @@ def estimated(model: Model, records: mi.Float, grid: Grid, quality: Quality) -> 
     positions = mi.Float(start)
     dr.enable_grad(positions)
     surface, maps, edges = model.surface(positions), model.maps(None), model.topology.walkable
-    frame = gradient.render(model.scene, surface, maps, edges, records, grid, quality, 0)
+    batch = gradient.render(model.scene, surface, maps, edges, records, grid, quality, 0)
     by_image = np.zeros((grid.pixels, 4), np.float32)
     by_image[:, 3] = 1
-    gradient.backward(gradient.surrogate(frame, surface, maps, edges, mi.Float(by_image.ravel())))
+    gradient.backward(gradient.surrogate(batch, surface, maps, edges, mi.Float(by_image.ravel())))
     return float(np.array(dr.grad(positions)).astype(np.float64) @ start)
 
 
