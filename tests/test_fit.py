@@ -23,7 +23,7 @@ from appearance_opt.fit.schedule import laplacian_weight
 from appearance_opt.fit.step import Gradients, StepInputs
 from appearance_opt.fit.validation import Validation
 from appearance_opt.initial.sphere import random_maps, sphere
-from appearance_opt.jobs.fitting import effort
+from appearance_opt.jobs.fitting import fit_policy
 from appearance_opt.jobs.simplify import simplify
 from appearance_opt.reference.mesh import MeshReference
 from appearance_opt.reference.pool import ReferencePool
@@ -282,7 +282,7 @@ def test_interrupt_keeps_the_best_state(ball: Asset) -> None:
 
 def test_good_starts_are_fitted_gently() -> None:
     quality = (15.0, 22.0, 28.0, 33.0, 34.5, 36.0, 38.0, 45.0)
-    rates = [effort(psnr, True)[1] for psnr in quality]
+    rates = [fit_policy(psnr, True)[1] for psnr in quality]
     for finer, coarser in pairwise(reversed(rates)):
         assert finer.base_color <= coarser.base_color and finer.position <= coarser.position
     assert rates[-1].base_color < 0.1 * rates[0].base_color
@@ -290,7 +290,7 @@ def test_good_starts_are_fitted_gently() -> None:
     shares = [r.position / r.base_color for r in rates]
     assert shares[0] == shares[3] == 1.0 and shares[3] > shares[4] > shares[5] > 0 and shares[-1] == shares[-2]
     # a short fit cannot afford the least rates
-    hasty, shorter = (effort(38.0, True, patience=p)[1] for p in (0.0, 0.5))
+    hasty, shorter = (fit_policy(38.0, True, patience=p)[1] for p in (0.0, 0.5))
     assert rates[-2].base_color < shorter.base_color < hasty.base_color == hasty.position
     # a grown shape is rough, whatever its error
-    assert effort(38.0, True, grown=True)[1].position > rates[0].position
+    assert fit_policy(38.0, True, grown=True)[1].position > rates[0].position

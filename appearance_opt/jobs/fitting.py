@@ -123,7 +123,7 @@ def fit_start(
     validation = Validation(reference, held_out, min(o.resolution, 256))
     parts = frozenset(o.fit) | ({DISPLACEMENT} if o.displaced else set())
     model = Model(start.mesh, start.maps, parts, Rates(), start.levels)
-    quality, rates = effort(validation.psnr(model), start.relative, start.grown, patience(o, watch, with_report))
+    quality, rates = fit_policy(validation.psnr(model), start.relative, start.grown, patience(o, watch, with_report))
     given = (o.position_rate, o.normal_rate, o.color_rate, o.material_rate, o.displacement_rate)
     defaults = (rates.position, rates.normal, rates.base_color, rates.material, rates.displacement)
     model.set_rates(Rates(*(d if g is None else g for g, d in zip(given, defaults, strict=True))))
@@ -175,11 +175,11 @@ four and eight times 0.008 spot (28 dB at the start) ends at 30.0, 30.9, 32.4, 3
 (25 dB) at 27.5, 28.7, 28.8, 29.1 and 28.3."""
 
 
-FINE = 0.25
+LEAST_RATE_SHARE = 0.25
 """Least share of the rates for starts that are better than 35 dB: what is left there is finer than what the views of a
 fit show."""
 
-STILL = 0.3
+LEAST_VERTEX_SHARE = 0.3
 """Least share of the rate of vertices, on top of that, for starts that are better than 34 dB: a vertex that moves turns
 the bumps of the normal map around it. After 600 steps, in the eyes of another renderer, chess_king at 8,104 triangles
 (37 dB), which starts at 37.2 to 37.5 dB, ends 0.6 dB below its start with half of all rates, 0.2 below with this share
@@ -200,7 +200,7 @@ def patience(options: CommonOptions, watch: Stopwatch, with_report: bool) -> flo
     return min(1.0, by_steps, 1.0 if seconds is None else seconds / LONG[1])
 
 
-def effort(psnr: float, likeness: bool, grown: bool = False, patience: float = 1.0) -> tuple[Quality, Rates]:
+def fit_policy(psnr: float, likeness: bool, grown: bool = False, patience: float = 1.0) -> tuple[Quality, Rates]:
     """Sampling and learning rates for a start of the given held-out PSNR (dB).
 
     A good start is easily spoilt: large steps undo it before they find something better. ``likeness``: False for
@@ -209,8 +209,8 @@ def effort(psnr: float, likeness: bool, grown: bool = False, patience: float = 1
     if not likeness:
         return Quality(1.0, 4, 1), Rates(0.05, 0.01, 0.02, 0.01, 0.05)
     rate = 0.008 * float(np.clip(10 ** ((25.0 - psnr) / 10.0), 0.25, 3.5))
-    still = float(np.clip(10 ** ((34.0 - psnr) / 3.0), STILL, 1.0)) ** patience
-    rate *= float(np.clip(10 ** ((35.0 - psnr) / 4.0), FINE, 1.0)) ** patience
+    still = float(np.clip(10 ** ((34.0 - psnr) / 3.0), LEAST_VERTEX_SHARE, 1.0)) ** patience
+    rate *= float(np.clip(10 ** ((35.0 - psnr) / 4.0), LEAST_RATE_SHARE, 1.0)) ** patience
     if grown:
         still, rate = 1.0, GROWN_RATE
     return Quality(), Rates(still * rate, rate, rate, rate, DISPLACEMENT_RATE * rate)

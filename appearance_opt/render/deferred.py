@@ -171,7 +171,7 @@ def visible(
     """(what every pixel shows at the offset (dx, dy), its depth, does it show anything?). By rays through ``scene`` or
     by drawing ``surface``, the same mesh, whichever is faster."""
     at = grid.view, grid.column, grid.row, dr.opaque(mi.Float, dx), dr.opaque(mi.Float, dy), grid.size
-    if raster.pays(surface, grid):
+    if raster.drawing_is_faster(surface, grid):
         mesh = surface.vertices, surface.faces, records
         hits, depth = run(raster.visible, *mesh, *at, grid.rows, grid.views, grid.pixels, surface.culled)
     else:

@@ -34,7 +34,7 @@ SLACK = 1e-6
 NOTHING = 0xFFFFFFFFFFFFFFFF
 
 
-def pays(surface: Surface, grid: Grid) -> bool:
+def drawing_is_faster(surface: Surface, grid: Grid) -> bool:
     """Is drawing the surface faster than tracing rays? Not known of GPUs, which have hardware for rays."""
     triangles = dr.width(surface.faces) // 4
     return mi.variant() == backend.CPU and triangles <= MOST_PER_PIXEL * grid.resolution**2

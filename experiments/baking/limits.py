@@ -55,7 +55,7 @@ def limits(asset: str, steps: int, views: int) -> dict:
     from appearance_opt.fit.model import Model, Rates
     from appearance_opt.fit.validation import Validation
     from appearance_opt.jobs.bake import BakeJob
-    from appearance_opt.jobs.fitting import POOL_SAMPLES, Stopwatch, effort, point_width
+    from appearance_opt.jobs.fitting import POOL_SAMPLES, Stopwatch, fit_policy, point_width
     from appearance_opt.reference.pool import ReferencePool
     from appearance_opt.views import MEASURED, Views
 
@@ -70,7 +70,7 @@ def limits(asset: str, steps: int, views: int) -> dict:
     drawn = Views.concatenate([sampler.draw(k, 4) for k in range(views // 4)])
     model = Model(job.mesh, maps, frozenset({"normal", "material"}), Rates())
     exact = Validation(job.reference, drawn, RESOLUTION, 16)
-    model.set_rates(effort(exact.psnr(model), likeness=True)[1])
+    model.set_rates(fit_policy(exact.psnr(model), likeness=True)[1])
     images = job.reference.render(drawn, RESOLUTION, 16)
     psnr, share, bound = outline_share(images, exact.render(model))
     # the pool draws the same groups of four from the same stream: it holds these views and no other

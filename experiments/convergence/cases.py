@@ -16,7 +16,7 @@ from appearance_opt.fit.model import Model, Rates
 from appearance_opt.fit.validation import Validation
 from appearance_opt.initial.sphere import random_maps
 from appearance_opt.jobs import growth
-from appearance_opt.jobs.fitting import POOL_SAMPLES, VALIDATION_VIEWS, effort, point_width
+from appearance_opt.jobs.fitting import POOL_SAMPLES, VALIDATION_VIEWS, fit_policy, point_width
 from appearance_opt.jobs.start import Start, make_start
 from appearance_opt.reference.mesh import MeshReference
 from appearance_opt.reference.pool import ReferencePool
@@ -113,7 +113,7 @@ def _from_mesh(
     def fresh(rates: Rates) -> Model:
         return Model(start.mesh, start.maps, frozenset(("shape", "normal", "material")), rates)
 
-    _, rates = effort(validation.psnr(fresh(Rates())), True)
+    _, rates = fit_policy(validation.psnr(fresh(Rates())), True)
     # a bent start must not be held in its shape
     fit_options = FitOptions(laplacian=options.laplacian if bend is None else 0.0, seed=seed)
     return Case(name, lambda: fresh(rates), pool, validation, fit_options)

@@ -54,12 +54,12 @@ class Bench:
         """PSNR before, in the middle and after; seconds include the first rendering of the pool's views."""
         from appearance_opt.fit.loop import FitOptions, fit
         from appearance_opt.fit.model import Model, Rates
-        from appearance_opt.jobs.fitting import effort
+        from appearance_opt.jobs.fitting import fit_policy
 
         parts, numbers = case.split(":")
         position, displacement, maps = (float(x) for x in numbers.split(","))
         model = Model(self.start.mesh, self.start.maps, frozenset(parts.split("+")), Rates(), self.start.levels)
-        quality, rates = effort(self.validation.psnr(model), self.start.relative)
+        quality, rates = fit_policy(self.validation.psnr(model), self.start.relative)
         scaled = (rates.position * position, *(r * maps for r in (rates.normal, rates.base_color, rates.material)))
         model.set_rates(Rates(*scaled, rates.displacement * displacement))
         found = fit(model, self.pool, self.validation, FitOptions(steps=steps, quality=quality, validate_every=0.5))

@@ -13,7 +13,7 @@ import numpy as np
 from appearance_opt.fit.loop import FitOptions, fit
 from appearance_opt.fit.model import Model, Rates
 from appearance_opt.fit.validation import Validation
-from appearance_opt.jobs.fitting import VALIDATION_VIEWS, effort
+from appearance_opt.jobs.fitting import VALIDATION_VIEWS, fit_policy
 from appearance_opt.reference.pool import ReferencePool
 from appearance_opt.views import VALIDATION
 from experiments.speed_vs_error.recorder import Blind, Recorder, Snapshot
@@ -126,7 +126,7 @@ def _rates(bench: Bench, start: Start) -> Rates:
     """The product's rule: from how good the start is."""
     views = bench.sampler.held_out(VALIDATION).draw(0, VALIDATION_VIEWS)
     model = Model(start.mesh, start.maps, frozenset(), Rates())
-    return effort(Validation(bench.reference, views, 256).psnr(model), start.relative)[1]
+    return fit_policy(Validation(bench.reference, views, 256).psnr(model), start.relative)[1]
 
 
 def _scaled(rates: Rates | None, factor: float) -> Rates:

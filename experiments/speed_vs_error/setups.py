@@ -126,7 +126,7 @@ def _large_steps(rate: float) -> Callable[[Setup], Setup | None]:
 def _plain_adam(s: Setup) -> Setup | None:
     if s.decimated:
         return None
-    rates = fitting.effort(0.0, False)[1]
+    rates = fitting.fit_policy(0.0, False)[1]
     return replace(s, smoothing=0.0, rates=rates, laplacian=FIRST_LAPLACIAN, relative=False)
 
 
