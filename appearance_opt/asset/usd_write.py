@@ -15,9 +15,12 @@ from appearance_opt.asset.alpha import coverage, kind_of
 from appearance_opt.asset.encoding import encoded_for
 from appearance_opt.asset.height import as_16_bit, height_png
 from appearance_opt.asset.paths import MAX_NAME
+from appearance_opt.asset.rows import unique_rows
 from appearance_opt.asset.sides import apart_from_sides
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from appearance_opt.asset.types import Asset, ColorSpace, Material, Mesh, Texture
 
 _SPACES: dict[str, ColorSpace] = {"sRGB": "srgb", "raw": "linear"}
@@ -105,32 +108,58 @@ def _mesh(stage: Any, target: str, mesh: Mesh, material: Any) -> None:
 
     out = UsdGeom.Mesh.Define(stage, target)
     out.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
-    out.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(mesh.positions, np.float32)))
+    positions = np.ascontiguousarray(mesh.positions, np.float32)
+    # vertices in one place are one point: editors take edges between points that are apart for a rim
+    first, place = _distinct(positions)
+    points, corners = positions[first], place[mesh.faces.ravel()].astype(np.int32)
+    out.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(points))
     out.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(mesh.faces), 3, np.int32)))
-    out.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(np.ascontiguousarray(mesh.faces, np.int32).ravel()))
-    low, high = mesh.positions.min(axis=0), mesh.positions.max(axis=0)
-    out.CreateExtentAttr(Vt.Vec3fArray.FromNumpy(np.stack([low, high]).astype(np.float32)))
+    out.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(corners))
+    out.CreateExtentAttr(Vt.Vec3fArray.FromNumpy(np.stack([points.min(axis=0), points.max(axis=0)])))
     out.CreateDoubleSidedAttr(mesh.material.double_sided)
+    kinds = Sdf.ValueTypeNames
     if mesh.normals is not None:
-        out.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(mesh.normals, np.float32)))
-        out.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
-    api = UsdGeom.PrimvarsAPI(out)
+        _add_primvar(out, "normals", kinds.Normal3fArray, mesh.normals, mesh.faces)
     if mesh.uvs is not None:
-        st = api.CreatePrimvar("st", Sdf.ValueTypeNames.TexCoord2fArray, UsdGeom.Tokens.vertex)
-        uvs = np.stack([mesh.uvs[:, 0], 1 - mesh.uvs[:, 1]], axis=1)
-        st.Set(Vt.Vec2fArray.FromNumpy(np.ascontiguousarray(uvs, np.float32)))
+        st = np.stack([mesh.uvs[:, 0], 1 - mesh.uvs[:, 1]], axis=1)
+        _add_primvar(out, "st", kinds.TexCoord2fArray, st, mesh.faces)
     if mesh.colors is not None:
-        color = api.CreatePrimvar("displayColor", Sdf.ValueTypeNames.Color3fArray, UsdGeom.Tokens.vertex)
         factor = mesh.material.base_color if _colored(mesh) else (1.0, 1.0, 1.0)
-        color.Set(
-            Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(mesh.colors[:, :3] * np.array(factor, np.float32), np.float32))
-        )
+        color = mesh.colors[:, :3] * np.array(factor, np.float32)
+        _add_primvar(out, "displayColor", kinds.Color3fArray, color, mesh.faces)
     if _veiled(mesh):
         assert mesh.colors is not None
-        alpha = mesh.colors[:, 3] * np.float32(coverage(mesh.material)[0])
-        veil = api.CreatePrimvar("displayOpacity", Sdf.ValueTypeNames.FloatArray, UsdGeom.Tokens.vertex)
-        veil.Set(Vt.FloatArray.FromNumpy(np.ascontiguousarray(alpha, np.float32)))
+        alpha = mesh.colors[:, 3:] * np.float32(coverage(mesh.material)[0])
+        _add_primvar(out, "displayOpacity", kinds.FloatArray, alpha, mesh.faces)
     UsdShade.MaterialBindingAPI.Apply(out.GetPrim()).Bind(material)
+
+
+def _add_primvar(out: Any, name: str, kind: Any, values: NDArray, faces: NDArray) -> None:
+    """Add a face-varying primvar to a mesh, with indices where that is smaller. ``values`` (V, K) of the vertices."""
+    from pxr import UsdGeom, Vt
+
+    values = np.ascontiguousarray(values, np.float32)
+    width = values.shape[1]
+    array = (Vt.FloatArray, Vt.Vec2fArray, Vt.Vec3fArray)[width - 1]
+    chosen, index = _distinct(values)
+    primvar = UsdGeom.PrimvarsAPI(out).CreatePrimvar(name, kind, UsdGeom.Tokens.faceVarying)
+    if len(chosen) * width + faces.size < faces.size * width:
+        primvar.SetIndices(Vt.IntArray.FromNumpy(index[faces.ravel()].astype(np.int32)))
+        stored = values[chosen]
+    else:
+        stored = values[faces.ravel()]
+    primvar.Set(array.FromNumpy(stored if width > 1 else stored.ravel()))
+
+
+def _distinct(values: NDArray[np.float32]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """(first row of each kind, in the order of the rows; kind of each row) of (N, K) numbers; both zeros are one."""
+    _, kind = unique_rows((values + np.float32(0)).view(np.uint32).astype(np.int64))
+    first = np.full(kind.max(initial=-1) + 1, len(kind))
+    np.minimum.at(first, kind, np.arange(len(kind)))
+    order = np.argsort(first)
+    rank = np.empty_like(order)
+    rank[order] = np.arange(len(order))
+    return first[order], rank[kind]
 
 
 def _material(stage: Any, target: str, m: Material, folder: Path, colored: bool, veiled: bool) -> Any:
