@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from appearance_opt.asset import images, load, mtl, resampling, uv_frames
+from appearance_opt.asset import images, load, mtl, resampling, uv_transforms
 from appearance_opt.asset.budget import BYTES, Budget
 from appearance_opt.asset.companions import Companions
 from appearance_opt.asset.polygons import MOST_CORNERS, Polygons, triangulate
@@ -125,17 +125,17 @@ def test_upright_grids_are_resampled_as_other_places_are() -> None:
 
 def test_resampled_textures_have_a_bound_together(ball: Asset, monkeypatch: pytest.MonkeyPatch) -> None:
     """Small pictures with different wrap modes, repeated often, would become large ones."""
-    monkeypatch.setattr(uv_frames, "ASSET_TEXELS", 2 * 40 * 40)
+    monkeypatch.setattr(uv_transforms, "ASSET_TEXELS", 2 * 40 * 40)
     one = Texture(np.zeros((4, 4, 3), np.uint8), "srgb")
     other = Texture(np.zeros((4, 4, 3), np.uint8), "linear", ("clamp", "clamp"))
     meshes, frames = [], {}
     for k in range(3):
         material = Material(f"m{k}", base_color_texture=one, orm_texture=other)
         meshes.append(replace(ball.meshes[0], uvs=ball.meshes[0].uvs * 8, material=material))
-        whole = uv_frames.Frame(uv_frames.affine(None))
+        whole = uv_transforms.UvTransform(uv_transforms.affine(None))
         frames[id(material)] = {"base_color_texture": whole, "orm_texture": whole}
     notes: list[str] = []
-    uv_frames.unified(meshes, frames, notes.append)
+    uv_transforms.unify(meshes, frames, notes.append)
     assert [("too large" in n) for n in notes] == [False, True, True]
 
 

@@ -10,7 +10,7 @@ import pytest
 from appearance_opt.asset import images, load
 from appearance_opt.asset.polygons import Polygons
 from appearance_opt.asset.subdivide import Sharpness, catmull_clark
-from appearance_opt.asset.uv_frames import apply, usd_affine
+from appearance_opt.asset.uv_transforms import apply, usd_affine
 from appearance_opt.errors import InputError
 
 HEAD = '#usda 1.0\n(metersPerUnit = 1\nupAxis = "Y")\n'

@@ -6,7 +6,7 @@ from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from appearance_opt.asset import images, specular_glossiness, udim, uv_frames
+from appearance_opt.asset import images, specular_glossiness, udim, uv_transforms
 from appearance_opt.asset.packing import with_occlusion
 from appearance_opt.asset.types import Material, Mesh, Texture, Volume, Wrap
 from appearance_opt.errors import InputError
@@ -42,7 +42,7 @@ class MaterialReader:
         self.note = document.companions.note
         self._images: dict[int, NDArray | None] = {}
         self._materials: dict[int | None, tuple[Material, list[int]]] = {}
-        self._frames: dict[int, dict[str, uv_frames.Frame]] = {}
+        self._transforms: dict[int, dict[str, uv_transforms.UvTransform]] = {}
         self._tiles: dict[int, Callable[[Tile], Material]] = {}
         self._tile: Tile | None = None  # the one that is read
         self._variant = self._number(variant)
@@ -71,9 +71,9 @@ class MaterialReader:
             self._materials[index] = self._place(index), self._sets(index)
         return self._materials[index]
 
-    def in_one_frame(self, meshes: list[Mesh], keep_layout: bool = False) -> list[Mesh]:
-        """The meshes as their textures read them; see ``uv_frames.placed``."""
-        return uv_frames.placed(meshes, self._frames, self.note, self._tiles, keep_layout)
+    def apply_uv_transforms(self, meshes: list[Mesh], keep_layout: bool = False) -> list[Mesh]:
+        """The meshes as their textures read them; see ``uv_transforms.apply_all``."""
+        return uv_transforms.apply_all(meshes, self._transforms, self.note, self._tiles, keep_layout)
 
     def _place(self, index: int | None, tile: Tile | None = None) -> Material:
         """A material, of one tile of its textures if it has some in tiles; where they read is remembered."""
@@ -82,8 +82,8 @@ class MaterialReader:
         material = Material() if index is None else self._read_material(index)
         self._tile = None
         sets = self._sets(index)
-        self._frames[id(material)] = {
-            n: uv_frames.Frame(uv_frames.affine(_transform(info)), sets.index(_coordinates(info)))
+        self._transforms[id(material)] = {
+            n: uv_transforms.UvTransform(uv_transforms.affine(_transform(info)), sets.index(_coordinates(info)))
             for n, info in infos.items()
         }
         if tile is None and any(self._tiled_name(info) for info in infos.values()):

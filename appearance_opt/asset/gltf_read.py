@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from appearance_opt.asset import uv_frames
+from appearance_opt.asset import uv_transforms
 from appearance_opt.asset.batch import Batch, in_range, replaced
 from appearance_opt.asset.gltf_accessors import Document
 from appearance_opt.asset.gltf_draco import DRACO, Compressed
@@ -73,7 +73,7 @@ class _Reader:
         meshes, origin = settle(meshes, self.note)
         if not self.keep_layout:
             meshes = self._flat_where_needed(meshes)
-        meshes = self.materials.in_one_frame(meshes, self.keep_layout)
+        meshes = self.materials.apply_uv_transforms(meshes, self.keep_layout)
         notes = self.document.companions.notes.lines()
         return Asset(tuple(meshes), self.path.stem, notes, origin=origin, contents=self._contents())
 
@@ -171,7 +171,7 @@ class _Reader:
             if material.alpha_mode == "opaque":  # their alpha means nothing
                 colors = colors[:, :3]
         names = [f"TEXCOORD_{k}" for k in sets]
-        uvs = uv_frames.stacked([_float(read(n)[:, :2]) if n in attributes else None for n in names])
+        uvs = uv_transforms.stack_sets([_float(read(n)[:, :2]) if n in attributes else None for n in names])
         positions = read("POSITION")[:, :3].astype(np.float64)
         return Mesh(positions, source.faces, normals, uvs, tangents, colors, material)  # type: ignore[arg-type]
 

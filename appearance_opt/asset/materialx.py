@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
     from appearance_opt.asset.materialx_nodes import Node
     from appearance_opt.asset.types import AlphaMode
-    from appearance_opt.asset.uv_frames import Place
+    from appearance_opt.asset.uv_transforms import Place
 
 
 @dataclass(frozen=True)

@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
-from appearance_opt.asset import images, uv_frames
+from appearance_opt.asset import images, uv_transforms
 from appearance_opt.asset.packing import resized
 from appearance_opt.asset.types import Texture
-from appearance_opt.asset.uv_frames import Place
+from appearance_opt.asset.uv_transforms import Place
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -347,7 +347,7 @@ def _coordinates(given: Input | None, depth: int) -> Place:
         return _coordinates(before, depth + 1).then(_upward(linear, offset - linear @ pivot + pivot))
     if node.category == "UsdTransform2d":
         scale, move = _pair(node, "scale", 1.0), _pair(node, "translation", 0.0)
-        matrix = uv_frames.usd_affine(tuple(scale), number(node, "rotation", 0.0), tuple(move))
+        matrix = uv_transforms.usd_affine(tuple(scale), number(node, "rotation", 0.0), tuple(move))
         return _coordinates(before, depth + 1).then(matrix)
     if node.category == "rotate2d":
         return _coordinates(before, depth + 1).then(_upward(_rotation(number(node, "amount", 0.0)), np.zeros(2)))

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from appearance_opt.asset import images, udim, uv_frames
+from appearance_opt.asset import images, udim, uv_transforms
 from appearance_opt.asset.packing import pack_orm, with_alpha
 from appearance_opt.asset.paths import read_text
 from appearance_opt.asset.types import Material, Texture, Wrap
@@ -66,24 +66,25 @@ UNIT, MOSTLY = 0.1, 0.9
 
 @dataclass(frozen=True)
 class _Map:
-    """A map statement: the file, and what its options say. ``frame``: (2, 3), from texture coordinates to the map's."""
+    """A map statement: the file, and what its options say. ``transform``: (2, 3), from texture
+    coordinates to the map's."""
 
     file: str
     wrap: Wrap = "repeat"
     strength: float = 1.0
     channel: int | None = None
-    frame: NDArray[np.float64] = field(default_factory=lambda: uv_frames.affine(None))
+    transform: NDArray[np.float64] = field(default_factory=lambda: uv_transforms.affine(None))
     ignored: tuple[str, ...] = ()
 
 
 class MaterialReader:
-    """Materials of the MTL files of one OBJ file: ``by_name``, and by ``id`` of a material the ``frames`` of its
-    textures (see ``uv_frames.unified``), and what reads its ``tiles`` if they have any (see ``udim.split``)."""
+    """Materials of the MTL files of one OBJ file: ``by_name``, and by ``id`` of a material the ``transforms`` of its
+    textures (see ``uv_transforms.unify``), and what reads its ``tiles`` if they have any (see ``udim.split``)."""
 
     def __init__(self, companions: Companions) -> None:
         self.companions, self.note = companions, companions.note
         self.by_name: dict[str, Material] = {}
-        self.frames: dict[int, dict[str, uv_frames.Frame]] = {}
+        self.transforms: dict[int, dict[str, uv_transforms.UvTransform]] = {}
         self.tiles: dict[int, Callable[[Tile], Material]] = {}
         self._files: set[Path] = set()
 
@@ -122,12 +123,12 @@ class MaterialReader:
             material = one.material()
         except (ValueError, IndexError):
             raise InputError(f"{path}: a value of material '{name}' is missing or not a number") from None
-        self.frames[id(material)] = one.frames
+        self.transforms[id(material)] = one.transforms
         return material
 
-    def placed(self, meshes: list[Mesh], keep_layout: bool) -> list[Mesh]:
-        """The meshes as their textures read them; see ``uv_frames.placed``."""
-        return uv_frames.placed(meshes, self.frames, self.note, self.tiles, keep_layout)
+    def apply_uv_transforms(self, meshes: list[Mesh], keep_layout: bool) -> list[Mesh]:
+        """The meshes as their textures read them; see ``uv_transforms.apply_all``."""
+        return uv_transforms.apply_all(meshes, self.transforms, self.note, self.tiles, keep_layout)
 
 
 class _Statements:
@@ -137,7 +138,7 @@ class _Statements:
         self, name: str, values: dict[str, str], path: Path, companions: Companions, tile: Tile | None
     ) -> None:
         self.name, self.values, self.path, self.companions, self.tile = name, values, path, companions, tile
-        self.frames: dict[str, uv_frames.Frame] = {}
+        self.transforms: dict[str, uv_transforms.UvTransform] = {}
 
     def material(self) -> Material:
         """Phong exponents become roughness sqrt(2 / (Ns + 2)). Constants beside a map are ignored, for many exporters
@@ -198,14 +199,14 @@ class _Statements:
         pixels = self._pixels(given.file)
         if pixels is None:
             if udim.is_tiled(given.file):
-                self.frames.setdefault(slot, uv_frames.Frame(given.frame))
+                self.transforms.setdefault(slot, uv_transforms.UvTransform(given.transform))
             return None
         if given.ignored:
             self._note(f"{' '.join(given.ignored)} of {key} ignored")
-        if slot in self.frames and not np.allclose(self.frames[slot].matrix, given.frame):
+        if slot in self.transforms and not np.allclose(self.transforms[slot].matrix, given.transform):
             which = "roughness and metalness" if slot == "orm_texture" else "colour and alpha"
             self._note(f"the maps of {which} differ in transform: the first one's is used for both")
-        self.frames.setdefault(slot, uv_frames.Frame(given.frame))
+        self.transforms.setdefault(slot, uv_transforms.UvTransform(given.transform))
         if one_channel:
             channel = given.channel
             if channel is None:  # what is named as a map of alpha is often a picture with alpha
@@ -287,7 +288,7 @@ def _map(statement: str) -> _Map:
         wrap="clamp" if found.get("-clamp") == ["on"] else "repeat",
         strength=float(found.get("-bm", ["1"])[0]),
         channel={"r": 0, "g": 1, "b": 2, "m": 3}.get(found.get("-imfchan", ["l"])[0]),
-        frame=uv_frames.usd_affine(scale[:2], 0.0, offset[:2]),  # these count v upward, too
+        transform=uv_transforms.usd_affine(scale[:2], 0.0, offset[:2]),  # these count v upward, too
         ignored=tuple(ignored),
     )
 

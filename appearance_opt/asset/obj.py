@@ -140,7 +140,7 @@ class _Parser:
             # of one that does not, as scans are, nothing is known
             groups = [np.array(g)[face] for g, (_, face) in zip(self.groups.values(), read, strict=True)]
             meshes = shaded(meshes, groups if self.says_groups else None, crease_angle)
-        meshes = self.materials.placed(meshes, keep_layout)
+        meshes = self.materials.apply_uv_transforms(meshes, keep_layout)
         return Asset(tuple(meshes), self.path.stem, self.companions.notes.lines(), origin=origin)
 
     def _mesh(

@@ -21,7 +21,7 @@ BAND = 1 << 20
 
 @dataclass(frozen=True)
 class Resampled:
-    """Textures under one frame. ``uvs``: (V, 2) of each mesh; ``textures``: by field name; ``what``: what they now
+    """Textures under one transform. ``uvs``: (V, 2) of each mesh; ``textures``: by field name; ``what``: what they now
     share, and what that costs; ``keeps_tangents``: do the meshes' tangents still fit the normal map?"""
 
     uvs: list[NDArray[np.float32]]
@@ -48,7 +48,7 @@ def bilinear_grid(texture: Texture, u: NDArray, v: NDArray) -> NDArray:
 
 def _taps(at: NDArray, size: int, mode: Wrap) -> list[tuple[NDArray[np.int64], NDArray[np.float64]]]:
     """(numbers of texels, their weights) along one axis: of both neighbours, or of one where none lies between."""
-    # the rounding of a frame there and back must not mix neighbours
+    # the rounding of a transform there and back must not mix neighbours
     at = np.round(at * size - 0.5, 6)
     corner = np.floor(at)
     fraction = at - corner
@@ -60,7 +60,7 @@ def _taps(at: NDArray, size: int, mode: Wrap) -> list[tuple[NDArray[np.int64], N
 def bilinear(texture: Texture, uv: NDArray) -> NDArray[np.float64]:
     """Stored values (N, C) at texture coordinates, wrapped as the texture says."""
     height, width = texture.pixels.shape[:2]
-    # the rounding of a frame there and back must not mix neighbours
+    # the rounding of a transform there and back must not mix neighbours
     at = np.round(uv * (width, height) - 0.5, 6)
     corner = np.floor(at)
     fraction = at - corner

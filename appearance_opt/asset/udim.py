@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
     from appearance_opt.asset.companions import Companions
     from appearance_opt.asset.types import Material, Mesh
-    from appearance_opt.asset.uv_frames import Frame
+    from appearance_opt.asset.uv_transforms import UvTransform
 
 FIRST, COLUMNS = 1001, 10
 MAX_ROWS = 899  # 1001 to 9990
@@ -120,15 +120,15 @@ def fitted(texture: Texture, tile: Tile, companions: Companions) -> Texture:
 def split(
     meshes: Sequence[Mesh],
     readers: Mapping[int, Callable[[Tile], Material]],
-    frames_of: MutableMapping[int, dict[str, Frame]],
+    transforms_of: MutableMapping[int, dict[str, UvTransform]],
     note: Callable[[str], None],
 ) -> list[Mesh]:
     """The meshes, those whose material is in ``readers`` (by ``id``) taken apart into their tiles.
 
-    ``readers`` read the material of a tile. ``frames_of``: by ``id`` of a material, where its textures read
-    (``uv_frames.unified``); for the tiles' materials, which ``readers`` put there, it is moved to their unit squares.
+    ``readers`` read the material of a tile. ``transforms_of``: by ``id`` of a material, where its textures read
+    (``uv_transforms.unify``); for the tiles' materials, which ``readers`` put there, it is moved to their unit squares.
     """
-    tiles = {k: _tiles(m, next(iter(frames_of[id(m.material)].values()))) for k, m in enumerate(meshes)
+    tiles = {k: _tiles(m, next(iter(transforms_of[id(m.material)].values()))) for k, m in enumerate(meshes)
              if id(m.material) in readers and m.uvs is not None}  # fmt: skip
     used: dict[int, set[int]] = {}
     for k, (tile, _) in tiles.items():
@@ -148,7 +148,7 @@ def split(
                 materials[key] = mesh.material
                 if number:
                     materials[key] = readers[key[0]](Tile(number, MAX_TEXELS // len(used[key[0]])))
-                    _move(frames_of[id(materials[key])], number)
+                    _move(transforms_of[id(materials[key])], number)
             part = _part(mesh, tile == number)
             out.append(replace(part, material=materials[key], name=f"{mesh.name}.{number}" if number else mesh.name))
     for name, count in crossing.items():
@@ -157,9 +157,9 @@ def split(
     return out
 
 
-def _tiles(mesh: Mesh, frame: Frame) -> tuple[NDArray[np.int64], int]:
+def _tiles(mesh: Mesh, transform: UvTransform) -> tuple[NDArray[np.int64], int]:
     """(the tile of each face, 0 outside of all; how many faces cross a border)."""
-    uvs = frame.of(np.asarray(mesh.uvs, np.float64))
+    uvs = transform.of(np.asarray(mesh.uvs, np.float64))
     inside = np.asarray(((mesh.faces >= 0) & (mesh.faces < len(uvs))).all(axis=1))  # the rest is for ``repair``
     corners = uvs[np.where(inside[:, None], mesh.faces, 0)]
     corners = np.stack([corners[..., 0], 1 - corners[..., 1]], axis=-1)
@@ -172,13 +172,13 @@ def _tiles(mesh: Mesh, frame: Frame) -> tuple[NDArray[np.int64], int]:
     return np.where(inside, FIRST + at[:, 0] + COLUMNS * at[:, 1], 0), int(crosses.sum())
 
 
-def _move(frames: dict[str, Frame], tile: int) -> None:
+def _move(transforms: dict[str, UvTransform], tile: int) -> None:
     """Move where textures read from a tile to the unit square; v counts downward here, tiles upward."""
     row, column = divmod(tile - FIRST, COLUMNS)
-    for name, frame in frames.items():
-        matrix = frame.matrix.copy()
+    for name, transform in transforms.items():
+        matrix = transform.matrix.copy()
         matrix[:, 2] += (-column, row)
-        frames[name] = replace(frame, matrix=matrix)
+        transforms[name] = replace(transform, matrix=matrix)
 
 
 def _part(mesh: Mesh, chosen: NDArray) -> Mesh:

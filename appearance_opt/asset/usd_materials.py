@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from appearance_opt.asset import images, specular_glossiness, udim, uv_frames
+from appearance_opt.asset import images, specular_glossiness, udim, uv_transforms
 from appearance_opt.asset.materialx import SURFACES, read_surface
 from appearance_opt.asset.materialx_file import find_surface
 from appearance_opt.asset.packing import pack_orm, with_alpha
@@ -18,7 +18,7 @@ from appearance_opt.asset.specular_glossiness import Specular
 from appearance_opt.asset.types import Material, Mesh, Texture
 from appearance_opt.asset.usd_networks import UsdNode
 from appearance_opt.asset.usd_package import read_packaged
-from appearance_opt.asset.uv_frames import Place
+from appearance_opt.asset.uv_transforms import Place
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
@@ -43,7 +43,7 @@ class MaterialReader:
     def __init__(self, stage: Any, path: Path, companions: Companions) -> None:
         self.stage, self.path, self.companions, self.note = stage, path, companions, companions.note
         self._materials: dict[str, Material] = {}
-        self.frames: dict[int, dict[str, uv_frames.Frame]] = {}
+        self.transforms: dict[int, dict[str, uv_transforms.UvTransform]] = {}
         self._sets: dict[int, tuple[str, ...]] = {}  # by id of a material, the primvars that its textures read
         self.tiles: dict[int, Callable[[Tile], Material]] = {}
         # while a material is read: the tile of its textures that is asked for, and whether it has any in tiles
@@ -120,7 +120,7 @@ class MaterialReader:
             if covers_in_part and one.alpha_mode == "opaque":
                 one = replace(one, alpha_mode="blend")
             self._worn[key] = one
-            self.frames[id(one)] = dict(self.frames.get(id(material), {}))
+            self.transforms[id(one)] = dict(self.transforms.get(id(material), {}))
             if id(material) in self.tiles:
                 self.tiles[id(one)] = partial(self._tile_on_mesh, self.tiles[id(material)], double, covers_in_part)
         return self._worn[key]
@@ -304,7 +304,9 @@ class MaterialReader:
         """Remember where the textures of a material read."""
         sets = tuple(dict.fromkeys(p.primvar for p in places.values()))
         self._sets[id(material)] = sets
-        self.frames[id(material)] = {n: uv_frames.Frame(p.matrix, sets.index(p.primvar)) for n, p in places.items()}
+        self.transforms[id(material)] = {
+            n: uv_transforms.UvTransform(p.matrix, sets.index(p.primvar)) for n, p in places.items()
+        }
 
     def _opacity(self, shader: Any) -> tuple[float, Texture | None, Any, float]:
         """(factor, texture of one channel or None, its node, threshold) of what a surface covers."""
@@ -313,9 +315,9 @@ class MaterialReader:
         texture, factor = self._scaled(node, "linear", channel, (float(opacity),) * 3)
         return factor[0], texture, node, threshold
 
-    def in_one_frame(self, meshes: list[Mesh], keep_layout: bool = False) -> list[Mesh]:
-        """The meshes as their textures read them; see ``uv_frames.placed``."""
-        return uv_frames.placed(meshes, self.frames, self.note, self.tiles, keep_layout)
+    def apply_uv_transforms(self, meshes: list[Mesh], keep_layout: bool = False) -> list[Mesh]:
+        """The meshes as their textures read them; see ``uv_transforms.apply_all``."""
+        return uv_transforms.apply_all(meshes, self.transforms, self.note, self.tiles, keep_layout)
 
     def _scaled(
         self, node: Any, space: str, channel: str, constant: tuple[float, float, float]
@@ -495,7 +497,7 @@ def _place(node: Any) -> Place:
     """Where a sampler reads, after the transforms before it."""
     from pxr import UsdShade
 
-    matrix = uv_frames.affine(None)
+    matrix = uv_transforms.affine(None)
     source = node.GetInput("st")
     for _ in range(MAX_TRANSFORMS):
         if not source:
@@ -510,12 +512,12 @@ def _place(node: Any) -> Place:
         if kind != "UsdTransform2d":
             break
         scale, rotation, move = (_value(before.GetInput(k)) for k in ("scale", "rotation", "translation"))
-        first = uv_frames.usd_affine(
+        first = uv_transforms.usd_affine(
             (1.0, 1.0) if scale is None else tuple(scale),
             0.0 if rotation is None else float(rotation),
             (0.0, 0.0) if move is None else tuple(move),
         )
-        matrix = uv_frames.composed(matrix, first)
+        matrix = uv_transforms.compose(matrix, first)
         source = before.GetInput("in")
     return Place(matrix=matrix)
 

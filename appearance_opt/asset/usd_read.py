@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from appearance_opt.asset import usd_shapes, uv_frames
+from appearance_opt.asset import usd_shapes, uv_transforms
 from appearance_opt.asset.alpha import OPAQUE
 from appearance_opt.asset.batch import smoothed
 from appearance_opt.asset.companions import Companions
@@ -219,7 +219,7 @@ class _Reader:
             elif prim.IsA(UsdGeom.Gprim) and self._shown(prim):
                 place = self._place([np.array(self._to_world(prim))])
                 meshes += [self._put(part, place) for part in self._parts(prim)]
-        meshes = self.materials.in_one_frame(meshes, self.keep_layout)
+        meshes = self.materials.apply_uv_transforms(meshes, self.keep_layout)
         meshes, origin = settle(meshes, self.note)
         notes = self.companions.notes.lines()
         return Asset(tuple(meshes), self.path.stem, notes, origin=origin, contents=self._contents())
@@ -483,7 +483,7 @@ class _Reader:
             of_kind, index = unique_rows(rows)
             used = rows[of_kind]
             got = {n: values[n][0][used[:, k]] for k, n in enumerate(names)}
-            uvs = uv_frames.stacked([got.get(_UVS + n) for n in uv_names])
+            uvs = uv_transforms.stack_sets([got.get(_UVS + n) for n in uv_names])
             colors = got.get("colors")
             if "opacity" in got:
                 colors = np.ones((len(used), 3)) if colors is None else colors

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from appearance_opt.asset.types import Mesh, Texture
-    from appearance_opt.asset.uv_frames import Frame
+    from appearance_opt.asset.uv_transforms import UvTransform
 
 PROBE = 512
 """Texels along the longer side of the image in which shared places of a layout are counted."""
@@ -35,18 +35,21 @@ SAMPLES = 20000
 """Points of the surface at which old and new values are compared."""
 
 
-def in_one_set(
-    meshes: Sequence[Mesh], textures: Mapping[str, Texture], frames: Mapping[str, Frame], most: int = MAX_TEXELS
+def under_one_set(
+    meshes: Sequence[Mesh],
+    textures: Mapping[str, Texture],
+    transforms: Mapping[str, UvTransform],
+    most: int = MAX_TEXELS,
 ) -> Resampled | None:
     """The textures drawn into the layout of one of their sets of coordinates, or None if the images would have more
     than ``most`` texels.
 
-    ``meshes``: all that wear the material, their sets side by side (``uv_frames.Frame``). Texels that no face uses hold
-    what the nearest face continues to.
+    ``meshes``: all that wear the material, their sets side by side
+    (``uv_transforms.UvTransform``). Texels that no face uses hold what the nearest face continues to.
     """
-    corners, positions = _corners(meshes, frames)
+    corners, positions = _corners(meshes, transforms)
     sizes = {n: np.array(t.pixels.shape[1::-1], np.float64) for n, t in textures.items()}
-    leading = _leading(corners, sizes, frames)
+    leading = _leading(corners, sizes, transforms)
     multiple = _multiple(corners, sizes, leading)
     placed = corners[leading] * sizes[leading]
     if not np.isfinite(placed).all() or not len(placed):
@@ -64,19 +67,20 @@ def in_one_set(
     for name, texture in textures.items():
         to = _maps(corners[leading] * size - low, corners[name])
         turns = None
-        if name == "normal_texture" and frames[name].coordinates != frames[leading].coordinates:
+        if name == "normal_texture" and transforms[name].coordinates != transforms[leading].coordinates:
             turns = _turns(positions, corners[name], corners[leading])
         new[name] = _drawn(texture, face, to, turns)
-    uvs = [((frames[leading].of(np.asarray(m.uvs)) * size - low) / extent).astype(np.float32) for m in meshes]
-    turned = "normal_texture" in frames and frames["normal_texture"].coordinates != frames[leading].coordinates
+    uvs = [((transforms[leading].of(np.asarray(m.uvs)) * size - low) / extent).astype(np.float32) for m in meshes]
+    normal = transforms.get("normal_texture")
+    turned = normal is not None and normal.coordinates != transforms[leading].coordinates
     loss = _loss(textures, new, corners, (corners[leading] * size - low) / extent, positions, turned)
     return Resampled(uvs, new, f"one set, {loss}", not turned)
 
 
-def _corners(meshes: Sequence[Mesh], frames: Mapping[str, Frame]) -> tuple[dict[str, NDArray], NDArray]:
+def _corners(meshes: Sequence[Mesh], transforms: Mapping[str, UvTransform]) -> tuple[dict[str, NDArray], NDArray]:
     """((F, 3, 2) places of the faces' corners in each texture, (F, 3, 3) their positions). Faces that cannot be used
     are left out: ``repair`` has not seen them yet."""
-    places: dict[str, list[NDArray]] = {n: [] for n in frames}
+    places: dict[str, list[NDArray]] = {n: [] for n in transforms}
     positions = []
     for mesh in meshes:
         uvs = np.asarray(mesh.uvs, np.float64)
@@ -85,21 +89,23 @@ def _corners(meshes: Sequence[Mesh], frames: Mapping[str, Frame]) -> tuple[dict[
         finite = np.asarray(np.isfinite(uvs).all(axis=1))
         faces = faces[finite[faces].all(axis=1)]
         positions.append(mesh.positions[faces].astype(np.float64))
-        for name, frame in frames.items():
-            places[name].append(frame.of(uvs)[faces])
+        for name, transform in transforms.items():
+            places[name].append(transform.of(uvs)[faces])
     return {n: np.concatenate(v) for n, v in places.items()}, np.concatenate(positions)
 
 
-def _leading(corners: Mapping[str, NDArray], sizes: Mapping[str, NDArray], frames: Mapping[str, Frame]) -> str:
+def _leading(
+    corners: Mapping[str, NDArray], sizes: Mapping[str, NDArray], transforms: Mapping[str, UvTransform]
+) -> str:
     """The texture whose coordinates all others are drawn in: of the layout that has least at places shared by several
     faces, there the normal map, else the finest."""
-    finest = sorted(frames, key=lambda n: (n != "normal_texture", -sizes[n].prod()))
+    finest = sorted(transforms, key=lambda n: (n != "normal_texture", -sizes[n].prod()))
     shared: dict[int, float] = {}
     for name in finest:
-        if frames[name].coordinates not in shared:
-            shared[frames[name].coordinates] = _shared(corners[name])
+        if transforms[name].coordinates not in shared:
+            shared[transforms[name].coordinates] = _shared(corners[name])
     least = min(shared.values())
-    return next(n for n in finest if shared[frames[n].coordinates] <= least + SHARED)
+    return next(n for n in finest if shared[transforms[n].coordinates] <= least + SHARED)
 
 
 def _shared(corners: NDArray) -> float:
