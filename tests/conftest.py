@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -14,6 +15,9 @@ from appearance_opt import backend
 from appearance_opt.asset.types import Asset, Material, Mesh, Texture
 from tests import looks
 from tests.inputs import watch_jobs
+
+# what a shell starts in the background ignores interrupts, and so does all that it starts: tests send some
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # the same examples everywhere, however long they take on a busy machine
 hypothesis.settings.register_profile(

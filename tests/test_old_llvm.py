@@ -50,7 +50,7 @@ JOBS: dict[str, Callable[[Asset, Path], object]] = {
         asset, out, maps=("normal", "object-normal", "material", "displacement", "ao", "curvature"), ao_rays=4
     ),
     "a joint bake": lambda asset, out: baked(asset, out, joint=True, subdivision=(1,)),
-    "compared": lambda asset, out: compare(asset, asset),
+    "compared": lambda asset, out: compare(asset, asset, views=1, resolution=64),
     "compared, transparent": lambda asset, out: compare(veiled(asset), asset, resolution=64),
 }
 
