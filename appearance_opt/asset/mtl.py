@@ -298,11 +298,7 @@ def _taken(text: str, option: str) -> tuple[list[str], str]:
     values: list[str] = []
     while len(values) < _MAP_OPTIONS[option]:
         word, rest = (text.split(None, 1) + ["", ""])[:2]
-        if (
-            values
-            and option in _OPTIONAL
-            and not (rest and re.fullmatch(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", word))
-        ):
+        if values and option in _OPTIONAL and not (rest and _NUMBER.fullmatch(word)):
             break  # the name of the file, even if it is a number
         if not word:
             raise ValueError

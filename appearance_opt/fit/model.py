@@ -79,7 +79,7 @@ class Drawn:
 class Model:
     """A latent mesh with maps, of which the parts named in ``fit`` are parameters.
 
-    ``fit``: subset of {"shape", "normal", "material", "gamma", "displacement"}. ``maps``: natural values of
+    ``fit``: subset of {"shape", "normal", "material", "displacement"}. ``maps``: natural values of
     every map the latent has, channel name -> (size, size), or a number for a channel that is constant. Maps
     that are not fitted are kept in a layer of their own, without gradients or moments. The map
     "displacement" has a size of its own; with it, or with ``levels`` other than (0,), the mesh is
@@ -309,6 +309,4 @@ def _tracked(layer: TexelLayer) -> TexelLayer:
 
 def _group(channel: str) -> str:
     """The part of ``fit`` that a channel belongs to."""
-    if channel in NORMALS:
-        return "normal"
-    return "gamma" if channel == "gamma" else "material"
+    return "normal" if channel in NORMALS else "material"

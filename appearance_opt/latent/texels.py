@@ -25,7 +25,6 @@ BOUNDS = {
     **dict.fromkeys(COLORS, (0.0, 1.0)),
     "roughness": (0.08, 1.0),
     "metalness": (0.0, 1.0),
-    "gamma": (0.0, 1.0),
     "normal_x": (-1.0, 1.0),
     "normal_y": (-1.0, 1.0),
     "normal_z": (0.05, 1.0),

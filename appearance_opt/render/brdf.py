@@ -1,8 +1,8 @@
 """Surface reflection: Lambert plus isotropic GGX under one point light.
 
 The formulas are those of glTF 2.0, appendix B (Schlick Fresnel, height-correlated Smith), so that what
-the fit sees is what engines show. Specular colour k_s = (1 - m) 0.04 + m k_d, scaled by (1 - gamma),
-after Hasselgren et al. 2021, section 3; gamma exists only when a latent fits it.
+the fit sees is what engines show. Specular colour k_s = (1 - m) 0.04 + m k_d, without the
+attenuation of Hasselgren et al. 2021, section 3, which no file format has.
 """
 
 from __future__ import annotations
@@ -28,14 +28,13 @@ a hundred times as large as all others."""
 @dataclass
 class MaterialSample:
     """Material at each sample. ``base_color``: linear. ``normal``: tangent-space normal, not
-    normalised, or None without a normal map. ``gamma``: specular attenuation or None. ``unlit``: shown in its base
-    colour: by sample, or True for all of them."""
+    normalised, or None without a normal map. ``unlit``: shown in its base colour: by
+    sample, or True for all of them."""
 
     base_color: mi.Color3f
     roughness: mi.Float
     metalness: mi.Float
     normal: mi.Vector3f | None = None
-    gamma: mi.Float | None = None
     unlit: mi.Bool | bool = False
 
 
@@ -47,8 +46,6 @@ def reflect(material: MaterialSample, n: mi.Vector3f, v: mi.Vector3f, l: mi.Vect
     alpha = dr.square(at_least(material.roughness, ROUGHNESS_FLOOR))
     alpha2 = dr.square(alpha)
     f0 = dr.fma(material.metalness, material.base_color - 0.04, mi.Color3f(0.04))
-    if material.gamma is not None:
-        f0 *= 1 - material.gamma
     diffuse = material.base_color * ((1 - material.metalness) * dr.inv_pi)
     h = unit(l + v)  # zero where the light is exactly behind: n.l is then below zero
     nl = dr.dot(n, l)

@@ -27,11 +27,11 @@ UNLIT = "unlit"
 
 COLORS = ("red", "green", "blue")
 
-CHANNELS = ("red", "green", "blue", "roughness", "metalness", "normal_x", "normal_y", "normal_z", "gamma")
+CHANNELS = ("red", "green", "blue", "roughness", "metalness", "normal_x", "normal_y", "normal_z")
 """Every channel a material can have. Colours are linear, normals in [-1, 1], all three of their channels or none."""
 
 DEFAULTS = {"red": 0.5, "green": 0.5, "blue": 0.5, "roughness": 0.5, "metalness": 0.0}
-"""What a channel is that a material does not have; without "gamma" the BRDF has none."""
+"""What a channel is that a material does not have."""
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ def evaluate(maps: MaterialMaps, hit: Hit) -> MaterialSample:
     unlit: mi.Bool | bool = UNLIT in maps.constants
     if maps.unlit is not None:
         unlit = dr.gather(mi.Bool, maps.unlit, hit.material)
-    return MaterialSample(base, value["roughness"], value["metalness"], normal, value.get("gamma"), unlit)
+    return MaterialSample(base, value["roughness"], value["metalness"], normal, unlit)
 
 
 def shading_normal(hit: Hit, sample: MaterialSample) -> mi.Vector3f:

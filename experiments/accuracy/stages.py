@@ -95,7 +95,7 @@ def reflection(one: Precision, two: Precision) -> list[Line]:
         results = []
         for p in (one, two):
             color = p.color(*(p.scalar(base[:, k]) for k in range(3)))
-            m = p.brdf.MaterialSample(color, p.scalar(roughness), p.scalar(metalness), None, p.scalar(rest[:, 2]))
+            m = p.brdf.MaterialSample(color, p.scalar(roughness), p.scalar(metalness))
             n = p.vector(np.tile(np.array([0, 0, 1], np.float32), (COUNT, 1)))
             results.append(p.brdf.reflect(m, n, p.vector(v), p.vector(light)))
         out.append(line("brdf.reflect", f"roughness {low} to {high}, all directions, mirror and grazing", *results))

@@ -29,7 +29,7 @@ from experiments.gradient_error.metrics import error_of
 from experiments.gradient_error.problems import BACKGROUND
 from experiments.gradient_error.reference import pixel_losses
 
-CHANNELS = ("red", "roughness", "metalness", "normal_x", "normal_y", "gamma")
+CHANNELS = ("red", "roughness", "metalness", "normal_x", "normal_y")
 FIELDS, SAMPLES, STEP = 10, 64, 2e-3
 SCENES = {"magnified, 64² texels on 128² pixels": (64, 128), "minified, 512² texels on 64² pixels": (512, 64)}
 SETTINGS = {
@@ -54,7 +54,7 @@ def main() -> None:
 def wavy_maps(size: int) -> dict[str, NDArray[np.float32]]:
     """Smooth maps that vary by about a fifth, a few waves across."""
     v, u = np.meshgrid(*[(np.arange(size) + 0.5) / size * 2 * np.pi] * 2, indexing="ij")
-    middle = {"red": 0.5, "green": 0.4, "blue": 0.3, "roughness": 0.45, "metalness": 0.4, "gamma": 0.3}
+    middle = {"red": 0.5, "green": 0.4, "blue": 0.3, "roughness": 0.45, "metalness": 0.4}
     maps = {k: m + 0.15 * np.sin((2 + i) * u + i) * np.cos(3 * v - i) for i, (k, m) in enumerate(middle.items())}
     maps["normal_x"] = 0.2 * np.sin(4 * u) * np.cos(2 * v)
     maps["normal_y"] = 0.2 * np.cos(3 * u + 1) * np.sin(4 * v)
@@ -77,7 +77,7 @@ def measure(scene: str, size: int, resolution: int) -> list[str]:
     """Table lines of one scene."""
     mesh = sphere(768, (0.0, 0.0, 0.0), 0.85, size)
     maps = wavy_maps(size)
-    model = Model(mesh, {**maps}, frozenset(("normal", "material", "gamma")), Rates())
+    model = Model(mesh, {**maps}, frozenset(("normal", "material")), Rates())
     assert model.codec is not None
     grid, views = Grid(1, resolution), ViewSampler((0.0, 0.0, 0.0), 1.0, seed=2, light_spread=40.0).draw(0, 1)
     records = views.records()
