@@ -18,7 +18,7 @@ from appearance_opt.asset.types import Asset, Mesh, srgb_to_linear
 from appearance_opt.baking.target_mesh import movable, unwrapped
 from appearance_opt.errors import InputError
 from appearance_opt.initial.decimate import decimate
-from appearance_opt.jobs.simplify import loaded
+from appearance_opt.jobs.simplify import load_source
 from appearance_opt.latent.latent import LatentMesh
 
 
@@ -189,7 +189,7 @@ def test_the_angle_reaches_the_reader(tmp_path: Path) -> None:
     rod = trimesh.creation.cylinder(1, 3, sections=12)
     path = written(tmp_path, "stl", rod.vertices, rod.faces)
     for options in (simplify_options(ratio=0.5, crease_angle=180), bake_options(crease_angle=180)):
-        assert len(loaded(path, options).meshes[0].positions) == 26
+        assert len(load_source(path, options).meshes[0].positions) == 26
     flat = load(path, crease_angle=180)
     assert compare(path, flat, views=1, resolution=32, samples=4).metrics.psnr_covered < 50
     assert compare(path, flat, views=1, resolution=32, samples=4, crease_angle=180).metrics.psnr_covered == 99

@@ -23,7 +23,14 @@ from appearance_opt.fit.loop import FitOptions, level_of
 from appearance_opt.fit.model import POSITIONS, TEXELS, Model, Rates
 from appearance_opt.fit.validation import Validation
 from appearance_opt.initial.sphere import sphere
-from appearance_opt.jobs.displaced import REACH, displaced, map_size, median_edge, without_outliers, write_companion
+from appearance_opt.jobs.displaced import (
+    REACH,
+    bake_displacement,
+    map_size,
+    median_edge,
+    without_outliers,
+    write_companion,
+)
 from appearance_opt.jobs.joint import joint
 from appearance_opt.jobs.simplify import SimplifyResult, simplify
 from appearance_opt.latent.displacement import DISPLACEMENT, Tessellator, footprint
@@ -113,8 +120,8 @@ def test_rays_that_meet_another_part_leave_no_spikes() -> None:
     reference = MeshReference(Asset((holed, shell)))
     radius = float(np.linalg.norm(inner.positions, axis=1).mean())
     mesh, o = sphere(1200, (0.0, 0.0, 0.0), radius, 128), options(subdivision=1)
-    far = displaced(reference, mesh, o)[1][DISPLACEMENT]
-    near = displaced(reference, mesh, o, REACH * median_edge(mesh))[1][DISPLACEMENT]
+    far = bake_displacement(reference, mesh, o)[1][DISPLACEMENT]
+    near = bake_displacement(reference, mesh, o, REACH * median_edge(mesh))[1][DISPLACEMENT]
     assert far.max() > 0.1 * radius  # it is there to be met
     assert np.abs(near).max() < REACH * median_edge(mesh) < 0.1 * radius
 

@@ -18,7 +18,7 @@ from appearance_opt.fit import adam
 from appearance_opt.fit.checkpoint import Checkpointer
 from appearance_opt.fit.smoothing import Smoother
 from appearance_opt.initial.sphere import sphere
-from appearance_opt.jobs.growth import stretched
+from appearance_opt.jobs.growth import stretch
 from appearance_opt.jobs.simplify import simplify
 from appearance_opt.jobs.start import Start
 from appearance_opt.latent.parameter import Parameter
@@ -88,11 +88,11 @@ def test_a_grown_sphere_becomes_the_object(ball: Asset) -> None:
 def test_spheres_start_in_the_box_of_the_object() -> None:
     corners = np.array([[-1.0, 0.0, 2.0], [3.0, 8.0, 2.0]])  # flat in z
     ball = sphere(300, (0.0, 0.0, 0.0), 1.0, 16)
-    p = stretched(ball, ViewSampler((0.0, 0.0, 0.0), 10.0, 0, hull=corners)).positions
+    p = stretch(ball, ViewSampler((0.0, 0.0, 0.0), 10.0, 0, hull=corners)).positions
     np.testing.assert_allclose((p.min(0) + p.max(0)) / 2, (1.0, 4.0, 2.0), atol=1e-5)
     # 95 % of the box, and a tenth of the radius where it is flat; 300 triangles reach the axes to 2 %
     np.testing.assert_allclose(np.ptp(p, axis=0), np.array([4.0, 8.0, 2.0]) * 0.95, rtol=0.03)
-    p = stretched(ball, ViewSampler((1.0, 0.0, 0.0), 10.0, 0)).positions
+    p = stretch(ball, ViewSampler((1.0, 0.0, 0.0), 10.0, 0)).positions
     np.testing.assert_allclose(np.linalg.norm(p - (1.0, 0.0, 0.0), axis=1), 6.0, rtol=1e-5)
 
 

@@ -89,10 +89,10 @@ def bake(
     outputs.check()
     outputs.check_sources(high, low, *inputs)
     with outputs.held(), Interrupts() as interrupts:
-        return _baked(high, low, outputs, options, progress, variants, watch, interrupts)
+        return _bake(high, low, outputs, options, progress, variants, watch, interrupts)
 
 
-def _baked(
+def _bake(
     high: str | Path | Asset,
     low: str | Path | Asset,
     outputs: Outputs,
@@ -135,10 +135,10 @@ def read_pair(
 ) -> tuple[Parts, Parts, str]:
     """(what of HIGH is baked, what of LOW is baked onto, what to call LOW). Raises InputError if it is nothing, or if
     the outputs would replace a file of either."""
-    from appearance_opt.jobs.simplify import loaded
+    from appearance_opt.jobs.simplify import load_source
 
     watch.begin("reading both meshes")
-    heavy, light = loaded(high, options, variants), loaded_low(low, options)
+    heavy, light = load_source(high, options, variants), load_low(low, options)
     outputs.check_inputs(heavy, light)
     outputs.check_room(light.triangle_count, options)
     watch.lap("load")
@@ -147,7 +147,7 @@ def read_pair(
     return split(heavy, f"HIGH, {names[0]}", "bake"), split(light, f"LOW, {names[1]}", "bake onto", False), names[1]
 
 
-def loaded_low(source: str | Path | Asset, options: BakeOptions) -> Asset:
+def load_low(source: str | Path | Asset, options: BakeOptions) -> Asset:
     """LOW itself, or the file of that name with its vertices and texture coordinates as they are."""
     if not isinstance(source, (str, Path)):
         return source
@@ -175,11 +175,11 @@ class BakeJob:
 
         self.options, self.watch, self.interrupts, self.low_parts = options, watch, interrupts, low_parts
         high, low = high_parts.fitted, low_parts.fitted
-        self.notes = [*high.notes, *high_parts.told("of HIGH are not baked")]
-        self.notes += [*(f"LOW: {n}" for n in low.notes), *low_parts.told("of LOW stay as they are")]
+        self.notes = [*high.notes, *high_parts.describe_kept("of HIGH are not baked")]
+        self.notes += [*(f"LOW: {n}" for n in low.notes), *low_parts.describe_kept("of LOW stay as they are")]
         self.high = high_parts.whole
         if options.align:
-            high, self.high = self._aligned(high_parts, low)
+            high, self.high = self._align(high_parts, low)
         check.check_place(high, low)
         if options.unwrap:
             low = unwrapped(low, options.texture_size)
@@ -196,7 +196,7 @@ class BakeJob:
         self.sampler = views_around(self.reference.merged.positions, options.seed, options.light)
         watch.lap("reference")
 
-    def _aligned(self, high_parts: Parts, low: Asset) -> tuple[Asset, Asset]:
+    def _align(self, high_parts: Parts, low: Asset) -> tuple[Asset, Asset]:
         """(what of HIGH is baked, all of it), aligned to what it is baked onto."""
         from appearance_opt.baking.align import align
 
@@ -224,7 +224,7 @@ class BakeJob:
         """The closed form, and the fit that starts from it."""
         from appearance_opt.baking.closed_form import bake as bake_closed_form
         from appearance_opt.jobs.fitting import fit_start
-        from appearance_opt.jobs.start import Start, told
+        from appearance_opt.jobs.start import Start, select_told
 
         self.watch.begin("casting rays from texels")
         baked = bake_closed_form(self.reference, self.mesh, self._settings())
@@ -244,7 +244,7 @@ class BakeJob:
         parts = self._fitted_parts()
         if not parts:
             return result, None
-        start = Start(self.mesh, told(self.reference, {n: baked.maps[n] for n in _FITTED}), True, baked.covered)
+        start = Start(self.mesh, select_told(self.reference, {n: baked.maps[n] for n in _FITTED}), True, baked.covered)
         options = replace(self.options, fit=parts)
         model, fitted, error = fit_start(
             self.reference,

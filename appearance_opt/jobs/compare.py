@@ -51,10 +51,10 @@ def compare(
     reading = {"refine": refine, "missing_textures": missing_textures, "root": root, "crease_angle": crease_angle}
     with outputs.held():
         given = ((reference, {**reading, "variants": variants}), (candidate, reading))
-        return _compared(given, outputs, (views, resolution, samples, seed, device))
+        return _compare(given, outputs, (views, resolution, samples, seed, device))
 
 
-def _compared(
+def _compare(
     both: tuple[tuple[str | Path | Asset, dict[str, Any]], tuple[str | Path | Asset, dict[str, Any]]],
     outputs: Outputs,
     drawing: tuple[int, int, int, int, str],

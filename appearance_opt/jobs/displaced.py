@@ -94,7 +94,7 @@ def flat_map(mesh: LatentMesh, options: CommonOptions) -> NDArray[np.float32]:
     return np.zeros((size, size), np.float32)
 
 
-def displaced(
+def bake_displacement(
     reference: MeshReference, mesh: LatentMesh, options: CommonOptions, reach: float | None = None
 ) -> tuple[LatentMesh, dict[str, NDArray[np.float32]]]:
     """Closed form: the displacement map that rays along the interpolated normals find within ``reach`` (None: the

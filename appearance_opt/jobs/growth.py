@@ -25,7 +25,7 @@ from appearance_opt.initial.decimate import decimate
 from appearance_opt.initial.sphere import random_maps, sphere
 from appearance_opt.interrupts import Interrupts
 from appearance_opt.jobs.fitting import VALIDATION_VIEWS, clean_maps
-from appearance_opt.jobs.start import Start, told, transferred
+from appearance_opt.jobs.start import Start, select_told, transfer_appearance
 from appearance_opt.latent.export import to_asset
 from appearance_opt.latent.latent import LatentMesh
 from appearance_opt.reference.mesh import MeshReference
@@ -80,37 +80,37 @@ class Effort:
     interrupts: Interrupts = field(default_factory=Interrupts)
 
 
-def grown(
+def grow_start(
     reference: Reference, sampler: ViewSampler, options: SimplifyOptions, triangles: int, effort: Effort
 ) -> tuple[Start, bool]:
     """(start, interrupted), grown from a sphere. Only images of the reference are used."""
     texture = min(TEXTURE, options.texture_size)
     mesh = first_shape(triangles, sampler, texture)
-    maps = told(reference, random_maps(texture, options.seed, options.normal_map and "normal" in options.fit))
-    model, result = _shaped(reference, sampler, options, mesh, maps, 1.0, effort)
+    maps = select_told(reference, random_maps(texture, options.seed, options.normal_map and "normal" in options.fit))
+    model, result = _fit_shape(reference, sampler, options, mesh, maps, 1.0, effort)
     likeness = to_asset(mesh, model.host_positions(), clean_maps(model, np.zeros((texture, texture), bool)), "grown")
     source = MeshReference(likeness)
     positions, faces = decimate(source.merged.positions, source.merged.faces, triangles)
     if not len(faces):
         raise InputError("nothing is left of the grown mesh at that budget; ask for more triangles")
-    start = transferred(source, unwrap(positions, faces, options.texture_size), options)
+    start = transfer_appearance(source, unwrap(positions, faces, options.texture_size), options)
     return replace(start, grown=True), result.interrupted
 
 
-def mended(
+def mend_start(
     reference: MeshReference, sampler: ViewSampler, options: SimplifyOptions, spoilt: LatentMesh, effort: Effort
 ) -> tuple[Start, bool]:
     """(start, interrupted): a spoilt mesh moved to where images want it, its triangles kept; atlas and
     maps are made anew. Neighbours move together, so that lost volume comes back and a patch that lies
     off moves as a whole, where steps of single vertices would crumple it."""
     small = with_values(options, texture_size=min(TEXTURE, options.texture_size))
-    maps = transferred(reference, spoilt, small).maps
-    model, result = _shaped(reference, sampler, options, spoilt, maps, MENDING, effort)
+    maps = transfer_appearance(reference, spoilt, small).maps
+    model, result = _fit_shape(reference, sampler, options, spoilt, maps, MENDING, effort)
     mesh = unwrap(model.host_positions(), spoilt.faces, options.texture_size, single=spoilt.single)
-    return transferred(reference, mesh, options), result.interrupted
+    return transfer_appearance(reference, mesh, options), result.interrupted
 
 
-def _shaped(
+def _fit_shape(
     reference: Reference,
     sampler: ViewSampler,
     options: SimplifyOptions,
@@ -150,10 +150,10 @@ def smoothing(triangles: int) -> tuple[float, float]:
 
 def first_shape(triangles: int, sampler: ViewSampler, texture: int) -> LatentMesh:
     """What grows into a mesh of ``triangles``."""
-    return stretched(sphere(OVERSAMPLING * triangles, (0.0, 0.0, 0.0), 1.0, texture), sampler)
+    return stretch(sphere(OVERSAMPLING * triangles, (0.0, 0.0, 0.0), 1.0, texture), sampler)
 
 
-def stretched(ball: LatentMesh, sampler: ViewSampler) -> LatentMesh:
+def stretch(ball: LatentMesh, sampler: ViewSampler) -> LatentMesh:
     """The unit sphere around the origin as an ellipsoid that nearly fills the box that views are framed to (a sphere of
     ``ROUND`` of the sampler's radius where they are not framed). A round one leaves the ends of a long object to a few
     vertices, which do not arrive there while the steps are still large."""

@@ -103,8 +103,8 @@ class Inspection:
             f"textures    {self.textures}, {_bytes(self.texture_bytes)} uncompressed",
         ]
         for what, names in (("skins", self.contents.skins), ("clips", self.contents.clips)):
-            out += _listed(f"{what:12}", names, f"{len(names)}: ") if names else []
-        out += _listed(f"{'variants':12}", self.contents.variants) if self.contents.variants else []
+            out += _list_names(f"{what:12}", names, f"{len(names)}: ") if names else []
+        out += _list_names(f"{'variants':12}", self.contents.variants) if self.contents.variants else []
         if any(self.origin):
             out.append("far away    its middle is near ({:.10g}, {:.10g}, {:.10g}) m".format(*self.origin))
         faults = {k: v for k, v in asdict(self.counts).items() if v and k not in ("triangles", "connected_parts")}
@@ -212,15 +212,15 @@ def _material_lines(m: MaterialFacts) -> list[str]:
     head = f"'{m.name}': {m.triangles:,} triangles{worn}, {m.seen}, {sides}; {m.simplify}"
     spaces = {"srgb": "sRGB", "linear": "linear"}
     maps = [f"{t.map} {t.width} x {t.height}, {t.bits} bit, {spaces[t.color_space]}" for t in m.maps]
-    return [*_wrapped("  ", head), *(line for text in maps for line in _wrapped("      ", text))]
+    return [*_wrap("  ", head), *(line for text in maps for line in _wrap("      ", text))]
 
 
-def _listed(head: str, names: Sequence[str], count: str = "") -> list[str]:
+def _list_names(head: str, names: Sequence[str], count: str = "") -> list[str]:
     more = f" and {len(names) - LISTED} more" if len(names) > LISTED else ""
-    return _wrapped(head, count + ", ".join(names[:LISTED]) + more)
+    return _wrap(head, count + ", ".join(names[:LISTED]) + more)
 
 
-def _wrapped(head: str, text: str) -> list[str]:
+def _wrap(head: str, text: str) -> list[str]:
     return textwrap.wrap(text, COLUMNS, initial_indent=head, subsequent_indent=" " * max(len(head), 6))
 
 

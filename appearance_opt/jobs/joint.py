@@ -45,10 +45,10 @@ def joint(
     outputs.check()
     outputs.check_sources(high, low, *inputs)
     with outputs.held(), Interrupts() as interrupts:
-        return _joined(high, low, outputs, options, progress, variants, watch, interrupts)
+        return _fit_pair(high, low, outputs, options, progress, variants, watch, interrupts)
 
 
-def _joined(
+def _fit_pair(
     high: str | Path | Asset,
     low: str | Path | Asset,
     outputs: Outputs,
@@ -65,7 +65,7 @@ def _joined(
     parts = read_pair(high, low, outputs, options, variants, watch)
     require_memory(parts[1].fitted.triangle_count, options)
     job = BakeJob(*parts, options, watch, interrupts)
-    result = _fitted(job, options, progress, outputs.report is not None)
+    result = _fit_job(job, options, progress, outputs.report is not None)
     if outputs.out is not None:
         write_result(result, outputs.out, options)
         watch.lap("write")
@@ -83,22 +83,22 @@ def _joined(
     return result
 
 
-def _fitted(job: BakeJob, options: BakeOptions, progress: Progress | None, with_report: bool) -> SimplifyResult:
+def _fit_job(job: BakeJob, options: BakeOptions, progress: Progress | None, with_report: bool) -> SimplifyResult:
     from appearance_opt.baking.closed_form import Settings, bake
     from appearance_opt.baking.target_mesh import movable
     from appearance_opt.fit.model import Model, Rates
     from appearance_opt.initial.transfer import transfer_emission
-    from appearance_opt.jobs.displaced import Exporter, displaced
+    from appearance_opt.jobs.displaced import Exporter, bake_displacement
     from appearance_opt.jobs.fitting import clean_maps, fit_start
-    from appearance_opt.jobs.start import Start, told
+    from appearance_opt.jobs.start import Start, select_told
 
     light, with_kept = job.low_parts.fitted, job.low_parts.with_kept
     mesh = movable(job.mesh)
-    drawn, displacement = displaced(job.reference, mesh, options, job.cage)
+    drawn, displacement = bake_displacement(job.reference, mesh, options, job.cage)
     found = bake(job.reference, drawn, Settings(options.texture_size, samples=options.samples))
     job.check_missed(found)
     maps = {n: v for n, v in found.maps.items() if options.wants("normal") or not n.startswith("normal")}
-    start = Start(mesh, {**told(job.reference, maps), **displacement}, True, found.covered, options.levels())
+    start = Start(mesh, {**select_told(job.reference, maps), **displacement}, True, found.covered, options.levels())
     job.watch.lap("closed form")
     parts = tuple(dict.fromkeys(("shape", *options.fit)))
     model, fitted, error = fit_start(

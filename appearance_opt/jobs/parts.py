@@ -34,7 +34,7 @@ class Parts:
         """What became of ``fitted``, with the kept meshes after it."""
         return replace(result, meshes=(*result.meshes, *self.kept)) if self.kept else result
 
-    def told(self, becomes: str) -> list[str]:
+    def describe_kept(self, becomes: str) -> list[str]:
         """Notes that name the kept meshes, or none without any. ``becomes``: what the job does with them."""
         if not self.kept:
             return []

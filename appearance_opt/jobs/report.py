@@ -43,7 +43,7 @@ def write_simplify_report(
 ) -> None:
     """Report of a simplification: start and result against the source."""
     names = ("start", f"level {max(result.tessellated)}" if result.tessellated else "result")
-    metrics, per_view = _measured(source, result.start, result.shown, names, sampler, placement)
+    metrics, per_view = _measure(source, result.start, result.shown, names, sampler, placement)
     metrics.update(_level_metrics(source, result, sampler, placement))
     data = ReportData(
         title=f"{source.name}: {result.source_triangles:,} to {result.triangles:,} triangles",
@@ -81,7 +81,7 @@ def write_bake_report(
 ) -> None:
     """Report of a bake: closed form and fit against HIGH (as it was aligned)."""
     names = ("closed form", "fitted" if result.fit is not None else "result")
-    metrics, per_view = _measured(high, result.closed_form, result.asset, names, sampler, placement)
+    metrics, per_view = _measure(high, result.closed_form, result.asset, names, sampler, placement)
     fit = result.fit
     facts: dict[str, object] = {
         "triangles": f"{result.asset.triangle_count} of {high.triangle_count}",
@@ -105,7 +105,7 @@ def write_bake_report(
     write_report(folder, data)
 
 
-def _measured(
+def _measure(
     source: Asset,
     start: Asset,
     result: Asset,

@@ -93,10 +93,10 @@ def simplify(
     if resume and checkpoint is None:
         raise InputError("--resume needs --checkpoint DIR")
     with outputs.held(), Interrupts() as interrupts:
-        return _simplified(source, outputs, options, resume, progress, variants, watch, interrupts)
+        return _simplify(source, outputs, options, resume, progress, variants, watch, interrupts)
 
 
-def _simplified(
+def _simplify(
     source: str | Path | Asset,
     outputs: Outputs,
     options: SimplifyOptions,
@@ -109,8 +109,8 @@ def _simplified(
     from appearance_opt.jobs.fitting import conclude
 
     watch.begin(f"reading {Path(source).name}" if isinstance(source, (str, Path)) else "checking the asset")
-    asset = loaded(source, options, variants)
-    first = loaded_start(options)
+    asset = load_source(source, options, variants)
+    first = load_init(options)
     outputs.check_inputs(asset, first)
     outputs.check_room(options.triangles or round((options.ratio or 1.0) * asset.triangle_count), options)
     parts = split(asset, str(source) if isinstance(source, (str, Path)) else asset.name, "simplify")
@@ -163,7 +163,7 @@ def write_result(result: SimplifyResult, out: Path, options: CommonOptions) -> N
                 write(asset, together.place(level_path(out, level)))
 
 
-def loaded(source: str | Path | Asset, options: CommonOptions, variants: dict[str, str] | None = None) -> Asset:
+def load_source(source: str | Path | Asset, options: CommonOptions, variants: dict[str, str] | None = None) -> Asset:
     """``source`` itself, or the file of that name, read as the options say."""
     if not isinstance(source, (str, Path)):
         return source
@@ -171,7 +171,7 @@ def loaded(source: str | Path | Asset, options: CommonOptions, variants: dict[st
     return load(source, refine=options.refine, variants=variants, **given)  # type: ignore[arg-type]
 
 
-def loaded_start(options: SimplifyOptions) -> Asset | None:
+def load_init(options: SimplifyOptions) -> Asset | None:
     """The asset that ``--init`` names; None if it names none. Its own maps are not used: it may lack them."""
     if not Path(options.init).suffix:
         return None
@@ -193,8 +193,8 @@ class _Job:
         with_report: bool,
     ) -> None:
         from appearance_opt.jobs.fitting import seconds_left
-        from appearance_opt.jobs.growth import grown, mended
-        from appearance_opt.jobs.start import atlas_of, budget, make_start, sided, transferred
+        from appearance_opt.jobs.growth import grow_start, mend_start
+        from appearance_opt.jobs.start import atlas_of, budget, inherit_sides, make_start, transfer_appearance
         from appearance_opt.reference.mesh import MeshReference
 
         self.options, self.watch, self.interrupts = options, watch, interrupts
@@ -202,7 +202,7 @@ class _Job:
         self.parts, asset = parts, parts.fitted
         self.notes = [
             *asset.notes,
-            *parts.told("pass into the result as they are, and count for no --triangles or --ratio"),
+            *parts.describe_kept("pass into the result as they are, and count for no --triangles or --ratio"),
         ]
         watch.begin(f"preparing {asset.triangle_count:,} triangles")
         self.placement = Placement.around(asset.points())
@@ -211,11 +211,13 @@ class _Job:
         self.sampler = views_around(self.reference.merged.positions, options.seed, options.light)
         if options.init == "sphere" and "shape" in options.fit and not options.displaced:
             triangles = budget(options, asset.triangle_count)
-            self.start = self._shaped(lambda effort: grown(self.reference, self.sampler, options, triangles, effort))
+            self.start = self._fit_shape(
+                lambda effort: grow_start(self.reference, self.sampler, options, triangles, effort)
+            )
         elif options.init in ("decimate", "sphere"):
             triangles = budget(options, asset.triangle_count)
             left = seconds_left(options, watch, with_report)
-            self.start = self._kept(
+            self.start = self._make_start(
                 lambda: make_start(self.reference, options, self.sampler, triangles, left, watch.begin)
             )
         else:
@@ -223,19 +225,21 @@ class _Job:
             mesh, notes = atlas_of(first, self.placement, asset.triangle_count, options, self.reference.single)
             self.notes += notes
             if options.relative is False and "shape" in options.fit and not options.displaced:
-                self.start = self._shaped(lambda effort: mended(self.reference, self.sampler, options, mesh, effort))
+                self.start = self._fit_shape(
+                    lambda effort: mend_start(self.reference, self.sampler, options, mesh, effort)
+                )
                 # the shape has been let go of; the mended one is a likeness
                 self.options = with_values(self.options, relative=None)
             else:
-                self.start = self._kept(lambda: transferred(self.reference, mesh, options))
-        self.start = sided(self.start, self.reference.single)
+                self.start = self._make_start(lambda: transfer_appearance(self.reference, mesh, options))
+        self.start = inherit_sides(self.start, self.reference.single)
         watch.lap("start")
 
-    def _kept(self, make: Callable[[], Start]) -> Start:
+    def _make_start(self, make: Callable[[], Start]) -> Start:
         """A start that a resumed run takes from beside its checkpoint."""
-        return self._begun(lambda: (make(), False))[0]
+        return self._make_or_resume(lambda: (make(), False))[0]
 
-    def _begun(self, make: Callable[[], tuple[Start, bool]]) -> tuple[Start, bool]:
+    def _make_or_resume(self, make: Callable[[], tuple[Start, bool]]) -> tuple[Start, bool]:
         from appearance_opt.jobs.start import Start
         from appearance_opt.latent.latent import LatentMesh
 
@@ -243,7 +247,7 @@ class _Job:
             return make()
         return self.checkpointer.start(make, Start, LatentMesh)
 
-    def _shaped(self, make_within: Callable[[Effort], tuple[Start, bool]]) -> Start:
+    def _fit_shape(self, make_within: Callable[[Effort], tuple[Start, bool]]) -> Start:
         """A start whose shape is fitted first, in a part of the time or the steps."""
         from appearance_opt.jobs.fitting import seconds_left
         from appearance_opt.jobs.growth import SHARE, Effort
@@ -254,7 +258,7 @@ class _Job:
         share = None if seconds is None else SHARE * seconds
         effort = Effort(share, None if steps is None else round(SHARE * steps), self.progress, self.interrupts)
 
-        start, interrupted = self._begun(lambda: make_within(effort))
+        start, interrupted = self._make_or_resume(lambda: make_within(effort))
         if interrupted:  # Ctrl-C ends both fits
             self.options = with_values(o, steps=0)
         elif steps is not None:

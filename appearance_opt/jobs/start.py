@@ -20,7 +20,7 @@ from appearance_opt.initial.sphere import SMALLEST as SMALLEST_SPHERE
 from appearance_opt.initial.sphere import random_maps, sphere
 from appearance_opt.initial.transfer import transfer
 from appearance_opt.initial.visibility import importance, pixel_counts
-from appearance_opt.jobs.displaced import REACH, displaced, flat_map, gutter, median_edge, require_memory
+from appearance_opt.jobs.displaced import REACH, bake_displacement, flat_map, gutter, median_edge, require_memory
 from appearance_opt.jobs.parts import split
 from appearance_opt.latent.displacement import DISPLACEMENT
 from appearance_opt.latent.latent import LatentMesh
@@ -122,14 +122,14 @@ def make_start(
         if triangles < SMALLEST_SPHERE:
             raise InputError(f"--init sphere needs at least {SMALLEST_SPHERE} triangles, not {triangles}")
         mesh = sphere(triangles, sampler.centre, 0.6 * sampler.radius, size)
-        maps = told(reference, random_maps(size, options.seed, options.normal_map and "normal" in options.fit))
+        maps = select_told(reference, random_maps(size, options.seed, options.normal_map and "normal" in options.fit))
         known = np.zeros((size, size), bool)
         if options.displaced:
             return Start(mesh, {**maps, DISPLACEMENT: flat_map(mesh, options)}, False, known, options.levels())
         return Start(mesh, {**maps}, False, known)
     starts = _Decimated(reference, options, sampler, triangles, tell)
     began = time.perf_counter()
-    start = starts.weighted(starts.weight)
+    start = starts.decimate(starts.weight)
     taken = time.perf_counter() - began
     if starts.coarse:
         left_out = "decimation began with a coarse round, and triangles were not moved to where they are missed"
@@ -139,8 +139,8 @@ def make_start(
     if not rounds:
         return start
     judge = StartError(reference, starts.views)
-    start, error = starts.moved(start, judge, rounds)
-    again = starts.spread(start, len(start.mesh.faces) <= TIGHT_TRIANGLES)
+    start, error = starts.move_triangles(start, judge, rounds)
+    again = starts.spread_texels(start, len(start.mesh.faces) <= TIGHT_TRIANGLES)
     return again if judge.measure(again.drawn, again.maps)[0] < error else start
 
 
@@ -196,7 +196,7 @@ class _Decimated:
             self.weight, seen = importance(self.positions, self.faces, pixels)
             self.visible = seen if seen.sum() >= triangles else self.visible
 
-    def weighted(self, weight: NDArray) -> Start:
+    def decimate(self, weight: NDArray) -> Start:
         """The reference decimated with these importances of its faces (F,)."""
         single = self.single[self.visible]
         positions, faces, source = decimate_with_source(
@@ -210,58 +210,58 @@ class _Decimated:
         if not len(faces):
             raise InputError("nothing is left of this mesh at that budget; ask for more triangles")
         self.tell(f"unwrapping {len(faces):,} triangles")
-        return self._mapped(charted(positions, faces, single[source]), np.ones(len(faces)), False)
+        return self._pack_and_bake(charted(positions, faces, single[source]), np.ones(len(faces)), False)
 
-    def moved(self, start: Start, judge: StartError, rounds: int) -> tuple[Start, float]:
+    def move_triangles(self, start: Start, judge: StartError, rounds: int) -> tuple[Start, float]:
         """The best of a start and those with triangles moved to where its image error is, and its error."""
         merged, weight = self.reference.merged, self.weight
         best, (error, by_face) = start, judge.measure(start.drawn, start.maps)
         for number in range(1, rounds + 1):
             weight = weight * weights(merged.positions, merged.faces, by_face, self.visible)
-            candidate = self.weighted(weight)
+            candidate = self.decimate(weight)
             again, by_face = judge.measure(candidate.drawn, candidate.maps)
             log.info("triangles moved, round %d: squared error of the start %.3g -> %.3g", number, error, again)
             if again < WORTHWHILE * error:
                 best, error = candidate, again
         return best, error
 
-    def spread(self, start: Start, tight: bool) -> Start:
+    def spread_texels(self, start: Start, tight: bool) -> Start:
         """The same triangles, with texels moved to where they are seen to be missing. ``tight``: see ``packed``."""
         assert start.charts is not None
         scale = np.ones(len(start.mesh.faces))
         # displaced vertices read the rim of a chart on both of its sides, which asks for the same texels everywhere
         if not self.options.displaced:
             scale = chart_scales(start.mesh, start.maps, self.views)
-        return self._mapped(start.charts, scale, tight)
+        return self._pack_and_bake(start.charts, scale, tight)
 
-    def _mapped(self, charts: LatentMesh, scale: NDArray, tight: bool) -> Start:
+    def _pack_and_bake(self, charts: LatentMesh, scale: NDArray, tight: bool) -> Start:
         options = self.options
         self.tell("packing the atlas and baking its maps")
         mesh = packed(charts, scale, options.texture_size, gutter(len(charts.faces), options), tight)
-        return replace(transferred(self.reference, mesh, options), charts=charts)
+        return replace(transfer_appearance(self.reference, mesh, options), charts=charts)
 
 
-def told(reference: Reference, maps: Mapping[str, NDArray | float]) -> dict[str, NDArray | float]:
+def select_told(reference: Reference, maps: Mapping[str, NDArray | float]) -> dict[str, NDArray | float]:
     """Those of a start's maps that images of the reference tell of: where it is not lit, colours alone."""
     unlit = isinstance(reference, MeshReference) and reference.unlit
     return {**{n: maps[n] for n in COLORS}, UNLIT: 1.0} if unlit else dict(maps)
 
 
-def transferred(reference: MeshReference, mesh: LatentMesh, options: SimplifyOptions) -> Start:
+def transfer_appearance(reference: MeshReference, mesh: LatentMesh, options: SimplifyOptions) -> Start:
     """A mesh with the reference's appearance in its maps."""
     finest = None
     displacement: dict[str, NDArray] = {}
     if options.displaced:
-        finest, displacement = displaced(reference, mesh, options, REACH * median_edge(mesh))
+        finest, displacement = bake_displacement(reference, mesh, options, REACH * median_edge(mesh))
     result = transfer(reference, mesh if finest is None else finest, options.texture_size, not options.keep_hidden)
     missed = result.missed.sum() / max(result.covered.sum(), 1)
     if missed > 0.01:
         log.warning("the transfer found no reference point for %.1f %% of the texels; they were filled", 100 * missed)
     maps = {n: v for n, v in result.maps.items() if options.normal_map or not n.startswith("normal")}
-    return Start(mesh, {**told(reference, maps), **displacement}, True, result.covered, options.levels(), finest)
+    return Start(mesh, {**select_told(reference, maps), **displacement}, True, result.covered, options.levels(), finest)
 
 
-def sided(start: Start, single: NDArray[np.bool_]) -> Start:
+def inherit_sides(start: Start, single: NDArray[np.bool_]) -> Start:
     """A start whose triangles stem from none of the reference's, of which those in ``single`` are seen from their front
     only: so are all of its triangles if all of these are."""
     if start.mesh.single is not None or not single.all():
@@ -307,4 +307,4 @@ def atlas_of(
         gutter(len(faces), options),
         single,
     )
-    return mesh, parts.told("of --init are left out: those of the input pass into the result")
+    return mesh, parts.describe_kept("of --init are left out: those of the input pass into the result")

@@ -18,7 +18,7 @@ from appearance_opt.initial.atlas import unwrap
 from appearance_opt.initial.sphere import random_maps
 from appearance_opt.jobs import growth
 from appearance_opt.jobs.displaced import gutter
-from appearance_opt.jobs.start import Start, budget, make_start, transferred
+from appearance_opt.jobs.start import Start, budget, make_start, transfer_appearance
 from appearance_opt.views import MEASURED
 from experiments import common
 from experiments.common import Placed, source_of
@@ -131,7 +131,7 @@ class Bench:
             mesh = self.start(first).mesh  # the same triangles in another atlas
             other = simplify_options("default", ratio=self.subject.ratio, steps=0, texture_size=texture)
             atlas = unwrap(mesh.positions, mesh.faces, texture, gutter(len(mesh.faces), other))
-            return transferred(self.reference, atlas, other), False
+            return transfer_appearance(self.reference, atlas, other), False
 
         key = hashlib.sha256(json.dumps(as_dict(options), sort_keys=True).encode() + self._path.read_bytes())
         folder = OUT / "starts"
