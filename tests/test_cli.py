@@ -86,7 +86,8 @@ def test_mistakes_end_in_one_line_and_code_2(ball: Asset, tmp_path: Path, argume
     assert done.returncode == 2, done.stderr
     # a busy machine may have said before what it does
     *stages, error = done.stderr.splitlines()
-    assert error.startswith("error: ") and all(re.match("reading|checking", line) for line in stages), done.stderr
+    assert error.startswith("error: "), done.stderr
+    assert all(re.match("reading|checking|preparing", line) for line in stages), done.stderr
     assert words in done.stderr
     assert {p.name for p in tmp_path.iterdir()} == names
     assert (tmp_path / "ball.glb").read_bytes() == before
