@@ -42,8 +42,8 @@ def arrays() -> dict[str, NDArray[np.float32]]:
     from appearance_opt.fit.losses import LOSSES
     from appearance_opt.fit.step import Gradients, StepInputs
     from appearance_opt.reference.pool import Targets
-    from appearance_opt.render.deferred import Grid
-    from appearance_opt.render.gradient import Quality
+    from appearance_opt.render.pixels import Grid
+    from appearance_opt.render.quality import Quality
     from experiments.bench.scene import set_up
 
     source, model, sampler = set_up(TRIANGLES, REFERENCE, MAPS)

@@ -13,8 +13,8 @@ from appearance_opt.asset.tangents import split_and_tangents
 from appearance_opt.fit.model import Model, Rates
 from appearance_opt.initial.sphere import sphere
 from appearance_opt.render import coverage, deferred, gradient, rays
-from appearance_opt.render.deferred import Grid
-from appearance_opt.render.gradient import Quality
+from appearance_opt.render.pixels import Grid
+from appearance_opt.render.quality import Quality
 from appearance_opt.views import ViewSampler
 from experiments.accuracy import physics, stages, textures
 from experiments.gradient_error.estimators import Ours

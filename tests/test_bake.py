@@ -29,7 +29,8 @@ from appearance_opt.initial.sphere import sphere
 from appearance_opt.jobs.bake import bake
 from appearance_opt.latent.latent import LatentMesh
 from appearance_opt.reference.mesh import MeshReference
-from appearance_opt.render.deferred import Grid, render_image
+from appearance_opt.render.deferred import render_image
+from appearance_opt.render.pixels import Grid
 from appearance_opt.views import ViewSampler
 from scenes.analytic import sphere_mesh
 from tests.test_cli import run

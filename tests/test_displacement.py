@@ -18,8 +18,8 @@ from appearance_opt.latent.displacement import DISPLACEMENT, Tessellator, footpr
 from appearance_opt.latent.subdivision import tessellate
 from appearance_opt.latent.texels import TexelCodec
 from appearance_opt.reference.pool import Targets
-from appearance_opt.render.deferred import Grid
-from appearance_opt.render.gradient import Quality
+from appearance_opt.render.pixels import Grid
+from appearance_opt.render.quality import Quality
 from appearance_opt.views import look_at
 
 LEVELS = range(5)

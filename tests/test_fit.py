@@ -27,7 +27,7 @@ from appearance_opt.jobs.fitting import fit_policy
 from appearance_opt.jobs.simplify import simplify
 from appearance_opt.reference.mesh import MeshReference
 from appearance_opt.reference.pool import ReferencePool
-from appearance_opt.render.gradient import Quality
+from appearance_opt.render.quality import Quality
 from appearance_opt.views import ViewSampler
 from tests.kernels import FIRST, LATER, looks_settle
 

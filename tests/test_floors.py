@@ -5,6 +5,8 @@ from __future__ import annotations
 import ast
 from pathlib import Path
 
+import pytest
+
 import appearance_opt
 
 ROOT = Path(appearance_opt.__file__).parent
@@ -25,12 +27,12 @@ def modules() -> dict[str, Path]:
     return {".".join(p.relative_to(ROOT).with_suffix("").parts): p for p in ROOT.rglob("*.py")}
 
 
-def imports(path: Path, known: dict[str, Path]) -> set[str]:
-    """Modules of the package that a module imports, within functions, too; not what only types need."""
+def imports(path: Path, known: dict[str, Path], types: bool = False) -> set[str]:
+    """Modules of the package that a module imports, within functions, too; what only types need if ``types``."""
     found: set[str] = set()
 
     def walk(node: ast.AST) -> None:
-        if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
+        if not types and isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
             return
         if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == ROOT.name:
             base = node.module.partition(".")[2]  # type: ignore[union-attr]
@@ -59,9 +61,12 @@ def test_every_part_has_its_floor_and_none_looks_up() -> None:
     assert not above
 
 
-def test_no_module_imports_itself_by_way_of_others() -> None:
-    known = modules()
-    graph = {name: imports(path, known) - {name} for name, path in known.items()}
+@pytest.mark.parametrize("part", ["", "render."])
+def test_no_module_imports_itself_by_way_of_others(part: str) -> None:
+    """Of the renderer not for types either: what its estimators share has modules of its own."""
+    known = {name: path for name, path in modules().items() if name.startswith(part)}
+    assert known
+    graph = {name: imports(path, known, types=bool(part)) - {name} for name, path in known.items()}
     while leaves := [name for name, others in graph.items() if not others & graph.keys()]:
         for name in leaves:
             del graph[name]

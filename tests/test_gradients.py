@@ -23,8 +23,8 @@ from appearance_opt.latent.latent import LatentMesh, LatentTopology, local_edge_
 from appearance_opt.latent.texels import TexelCodec
 from appearance_opt.reference.pool import Targets
 from appearance_opt.render import deferred, gradient
-from appearance_opt.render.deferred import Grid
-from appearance_opt.render.gradient import Quality
+from appearance_opt.render.pixels import Grid
+from appearance_opt.render.quality import Quality
 from appearance_opt.views import ViewSampler
 
 SAMPLER = ViewSampler((0.0, 0.0, 0.0), 1.0, seed=5)

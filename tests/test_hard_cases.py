@@ -18,8 +18,9 @@ from appearance_opt.latent.export import to_asset
 from appearance_opt.latent.latent import LatentMesh
 from appearance_opt.reference.mesh import MeshReference
 from appearance_opt.reference.pool import Targets
-from appearance_opt.render.deferred import Grid, render_image
-from appearance_opt.render.gradient import Quality
+from appearance_opt.render.deferred import render_image
+from appearance_opt.render.pixels import Grid
+from appearance_opt.render.quality import Quality
 from appearance_opt.views import Views, ViewSampler, look_at
 from tests.conftest import grid_sphere, make_asset
 

@@ -16,8 +16,9 @@ from appearance_opt.fit.step import Gradients
 from appearance_opt.initial.sphere import sphere
 from appearance_opt.latent.latent import LatentMesh
 from appearance_opt.render import deferred, gradient, silhouette_walk
-from appearance_opt.render.deferred import Grid
-from appearance_opt.render.gradient import Quality, RenderedBatch
+from appearance_opt.render.gradient import RenderedBatch
+from appearance_opt.render.pixels import Grid
+from appearance_opt.render.quality import Quality
 from appearance_opt.render.silhouette import edge_list, walkable
 from appearance_opt.render.surface import Surface
 from appearance_opt.views import Views, ViewSampler

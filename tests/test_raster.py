@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from appearance_opt.initial.sphere import sphere
 from appearance_opt.render import raster, rays, upload
-from appearance_opt.render.deferred import Grid
+from appearance_opt.render.pixels import Grid
 from appearance_opt.render.rays import MISS
 from appearance_opt.views import Views, ViewSampler, look_at
 from scenes.analytic import bumpy_sphere

@@ -16,8 +16,8 @@ from appearance_opt.latent.texels import TexelCodec
 from appearance_opt.placement import Placement
 from appearance_opt.reference.mesh import MeshReference
 from appearance_opt.render import rays, texture, upload
-from appearance_opt.render.deferred import Grid
 from appearance_opt.render.math import angle_of
+from appearance_opt.render.pixels import Grid
 from appearance_opt.render.texture import CLAMP, MIRROR, REPEAT, Base, build_pyramid
 from appearance_opt.views import ViewSampler, look_at
 from experiments import mitsuba_peer

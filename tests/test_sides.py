@@ -13,8 +13,8 @@ from appearance_opt.asset.types import Material, Mesh
 from appearance_opt.baking.occlusion import exposed
 from appearance_opt.initial.sphere import sphere
 from appearance_opt.render import raster, rays, upload
-from appearance_opt.render.deferred import Grid
 from appearance_opt.render.passing import MISS, SidedScene, meet
+from appearance_opt.render.pixels import Grid
 from appearance_opt.views import Views, ViewSampler
 
 SAMPLER = ViewSampler((0.0, 0.0, 0.0), 1.0, seed=3)

@@ -18,9 +18,9 @@ from appearance_opt.fit.model import TEXELS, Model, Rates
 from appearance_opt.fit.step import Gradients
 from appearance_opt.jobs.inspect import inspect
 from appearance_opt.reference.mesh import MeshReference
-from appearance_opt.render.deferred import Grid
-from appearance_opt.render.gradient import Quality
 from appearance_opt.render.material import UNLIT
+from appearance_opt.render.pixels import Grid
+from appearance_opt.render.quality import Quality
 from appearance_opt.views import look_at
 from tests.conftest import grid_sphere, make_asset
 from tests.test_gradients import make_inputs, make_model

@@ -21,9 +21,9 @@ from appearance_opt.fit.step import Gradients, StepInputs, StepResult, first_non
 from appearance_opt.fit.validation import Validation
 from appearance_opt.latent.displacement import DISPLACEMENT
 from appearance_opt.latent.latent import local_edge_length
-from appearance_opt.render.deferred import Grid
 from appearance_opt.render.display import BACKGROUND as GREY
-from appearance_opt.render.gradient import Quality
+from appearance_opt.render.pixels import Grid
+from appearance_opt.render.quality import Quality
 
 if TYPE_CHECKING:
     from collections.abc import Callable

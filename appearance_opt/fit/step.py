@@ -21,10 +21,10 @@ if TYPE_CHECKING:
     from appearance_opt.fit.losses import Loss
     from appearance_opt.fit.model import Model, Shape
     from appearance_opt.reference.pool import Targets
-    from appearance_opt.render.deferred import Grid
     from appearance_opt.render.freezing import Run
-    from appearance_opt.render.gradient import Quality
     from appearance_opt.render.material import TexelLayer
+    from appearance_opt.render.pixels import Grid
+    from appearance_opt.render.quality import Quality
     from appearance_opt.render.surface import Surface
     from appearance_opt.views import Views
 

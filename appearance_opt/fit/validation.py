@@ -8,8 +8,9 @@ import numpy as np
 
 from appearance_opt.errors import DivergedError
 from appearance_opt.reference.pool import checked
-from appearance_opt.render.deferred import Grid, render_image
+from appearance_opt.render.deferred import render_image
 from appearance_opt.render.display import display
+from appearance_opt.render.pixels import Grid
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

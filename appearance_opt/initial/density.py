@@ -17,9 +17,10 @@ from appearance_opt.initial.atlas import charts_of, uv_areas
 from appearance_opt.latent.latent import LatentTopology
 from appearance_opt.latent.texels import maps_of
 from appearance_opt.render import rays
-from appearance_opt.render.deferred import Grid, render_image
+from appearance_opt.render.deferred import render_image
 from appearance_opt.render.display import display
 from appearance_opt.render.material import CHANNELS, MaterialMaps
+from appearance_opt.render.pixels import Grid
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

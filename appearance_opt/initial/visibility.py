@@ -11,7 +11,7 @@ import numpy as np
 from appearance_opt.asset.normals import weld
 from appearance_opt.initial.stacks import coincident
 from appearance_opt.render import rays
-from appearance_opt.render.deferred import Grid
+from appearance_opt.render.pixels import Grid
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -15,7 +15,7 @@ from appearance_opt.fit.validation import Validation
 from appearance_opt.initial.fill import fill
 from appearance_opt.latent.displacement import DISPLACEMENT
 from appearance_opt.reference.pool import ReferencePool
-from appearance_opt.render.gradient import Quality
+from appearance_opt.render.quality import Quality
 from appearance_opt.views import VALIDATION
 
 if TYPE_CHECKING:

@@ -16,9 +16,9 @@ from appearance_opt.asset.sides import culled, single_sided
 from appearance_opt.asset.tangents import any_tangent, split_and_tangents
 from appearance_opt.reference.textures import coverage_maps, emission_maps, material_maps
 from appearance_opt.render import deferred, layers, upload
-from appearance_opt.render.deferred import Grid
 from appearance_opt.render.freezing import Frozen
 from appearance_opt.render.material import UNLIT, evaluate, shading_normal
+from appearance_opt.render.pixels import Grid
 from appearance_opt.render.surface import Surface, face_normal, interpolate_at
 
 if TYPE_CHECKING:

@@ -17,6 +17,7 @@ from appearance_opt.render import brdf, material, outlines, raster, rays
 from appearance_opt.render.freezing import traced
 from appearance_opt.render.material import MaterialMaps
 from appearance_opt.render.math import at_least
+from appearance_opt.render.pixels import Grid, pixel_index
 from appearance_opt.render.rays import Samples
 from appearance_opt.render.surface import Surface, interpolate
 
@@ -27,36 +28,6 @@ if TYPE_CHECKING:
 NEAREST_LIGHT = 1e-3
 """Distance below which a light gets no brighter (the object's radius is 1 in a fit): a point light that touches a
 surface is infinitely bright there."""
-
-
-class Grid:
-    """The pixels of a batch of square images, on the device, tile by tile (see ``rays.TILE``).
-
-    ``size``, ``rows``: the resolution as opaque numbers, so that another one compiles no new kernel.
-    ``view``, ``column``, ``row``: of every pixel. Made once and reused by every step.
-    """
-
-    def __init__(self, views: int, resolution: int) -> None:
-        self.views = views
-        self.resolution = resolution
-        self.size = dr.opaque(mi.Float, resolution)
-        self.rows = dr.opaque(mi.UInt32, resolution)
-        self.view, self.column, self.row = rays.pixel_grid(views, resolution)
-        dr.eval(self.view, self.column, self.row)
-        self._finer: dict[int, Grid] = {}
-
-    def finer(self, factor: int) -> Grid:
-        """``factor`` squared points in every pixel, as a grid of their own; made when first asked for."""
-        if factor == 1:
-            return self
-        if factor not in self._finer:
-            self._finer[factor] = Grid(self.views, self.resolution * factor)
-        return self._finer[factor]
-
-    @property
-    def pixels(self) -> int:
-        """Pixels of the whole batch."""
-        return self.views * self.resolution * self.resolution
 
 
 def shade(
@@ -76,12 +47,6 @@ def shade(
     irradiance = camera.intensity / squared_distance
     lit = brdf.reflect(sample, normal, hit.to_viewer, to_light) * irradiance
     return lit if sample.unlit is False else dr.select(sample.unlit, sample.base_color, lit)
-
-
-def pixel_index(samples: Samples, resolution: mi.UInt32) -> mi.UInt32:
-    """Index of the pixel of each sample in the batch: (view, row, column), row major."""
-    column, row = mi.UInt32(samples.x), mi.UInt32(samples.y)
-    return (samples.view * resolution + row) * resolution + column
 
 
 @dataclass(frozen=True)

@@ -17,10 +17,11 @@ from appearance_opt.render import deferred, rays
 from appearance_opt.render.freezing import traced
 from appearance_opt.render.material import TexelLayer
 from appearance_opt.render.passing import MISS, meet
+from appearance_opt.render.pixels import Grid, pixel_index
 from appearance_opt.render.surface import interpolate
 
 if TYPE_CHECKING:
-    from appearance_opt.render.deferred import Drawing, Grid
+    from appearance_opt.render.deferred import Drawing
     from appearance_opt.render.freezing import Run
     from appearance_opt.render.material import MaterialMaps
     from appearance_opt.render.passing import Scene
@@ -137,7 +138,7 @@ def _added(
     part = dr.gather(mi.Float, share, index) * weight
     out = mi.Float(image)
     value = mi.ArrayXf([color.x * part, color.y * part, color.z * part, part])
-    pixel = deferred.pixel_index(some, drawing.rows)
+    pixel = pixel_index(some, drawing.rows)
     dr.scatter_reduce(dr.ReduceOp.Add, out, value, pixel, mode=dr.ReduceMode.NoConflicts)
     return out
 

@@ -29,10 +29,10 @@ import drjit as dr
 import mitsuba as mi
 
 from appearance_opt.render import intersections, rays, silhouette
-from appearance_opt.render.deferred import Grid, pixel_index
 from appearance_opt.render.freezing import traced
 from appearance_opt.render.intersections import Intersections
 from appearance_opt.render.math import clamp
+from appearance_opt.render.pixels import Grid, pixel_index
 from appearance_opt.render.ray_lists import Weighted, Whole, concat, joined
 from appearance_opt.render.rays import MISS, Samples
 from appearance_opt.render.silhouette import EdgeList, EdgeSamples
@@ -40,8 +40,8 @@ from appearance_opt.render.silhouette_walk import Neighbours, choose, neighbours
 
 if TYPE_CHECKING:
     from appearance_opt.render.freezing import Run
-    from appearance_opt.render.gradient import Quality
     from appearance_opt.render.passing import Scene
+    from appearance_opt.render.quality import Quality
 
 
 @dataclass

@@ -19,7 +19,7 @@ from appearance_opt.render import rays
 from appearance_opt.render.rays import MISS, Samples
 
 if TYPE_CHECKING:
-    from appearance_opt.render.deferred import Grid
+    from appearance_opt.render.pixels import Grid
     from appearance_opt.render.surface import Surface
 
 MOST_PER_PIXEL = 4

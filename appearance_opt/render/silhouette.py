@@ -28,9 +28,9 @@ from appearance_opt.render.rays import Samples
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from appearance_opt.render.deferred import Grid
     from appearance_opt.render.freezing import Run
     from appearance_opt.render.passing import Scene
+    from appearance_opt.render.pixels import Grid
 
 OFFSET = 1e-6
 """Distance of the two rays from the edge, in widths of the image: eight times the rounding of a ray's direction. Fine

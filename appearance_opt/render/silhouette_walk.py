@@ -8,8 +8,8 @@ import drjit as dr
 import mitsuba as mi
 
 from appearance_opt.render import rays, silhouette
-from appearance_opt.render.deferred import Grid, pixel_index
 from appearance_opt.render.outlines import NOTHING
+from appearance_opt.render.pixels import Grid, pixel_index
 from appearance_opt.render.ray_lists import concat, joined
 from appearance_opt.render.rays import MISS, Samples
 from appearance_opt.render.silhouette import EdgeList

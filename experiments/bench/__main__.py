@@ -91,8 +91,8 @@ def run_case(
     from appearance_opt.fit.step import Gradients, StepInputs, first_non_finite, step
     from appearance_opt.jobs.fitting import POOL_SAMPLES, point_width
     from appearance_opt.reference.pool import ReferencePool, Targets
-    from appearance_opt.render.deferred import Grid
-    from appearance_opt.render.gradient import Quality
+    from appearance_opt.render.pixels import Grid
+    from appearance_opt.render.quality import Quality
     from experiments.bench.scene import set_up
 
     source, model, sampler = set_up(latent, reference, maps, room)

@@ -20,10 +20,10 @@ from appearance_opt.fit.losses import LOSSES, Target, compared_pixels, covered_l
 from appearance_opt.fit.model import POSITIONS, TEXELS, Shape
 from appearance_opt.jobs.fitting import point_width
 from appearance_opt.render import gradient
-from appearance_opt.render.deferred import Grid
 from appearance_opt.render.freezing import Frozen
-from appearance_opt.render.gradient import Quality
 from appearance_opt.render.material import TexelLayer
+from appearance_opt.render.pixels import Grid
+from appearance_opt.render.quality import Quality
 from experiments.bench.scene import set_up
 
 REPEATS = 15

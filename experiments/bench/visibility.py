@@ -16,8 +16,8 @@ import numpy as np
 
 from appearance_opt import backend
 from appearance_opt.render import raster, rays, upload
-from appearance_opt.render.deferred import Grid
 from appearance_opt.render.freezing import Frozen
+from appearance_opt.render.pixels import Grid
 from appearance_opt.views import ViewSampler
 from scenes.analytic import bumpy_sphere
 

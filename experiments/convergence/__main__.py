@@ -20,7 +20,7 @@ from pathlib import Path
 
 from appearance_opt import backend
 from appearance_opt.fit.loop import fit
-from appearance_opt.render.gradient import Quality
+from appearance_opt.render.quality import Quality
 from experiments.convergence.cases import Case, make_case, names, source
 from experiments.convergence.plot import draw
 

@@ -35,8 +35,8 @@ def measure(triangles: int, level: int) -> str:
     from appearance_opt.fit.step import Gradients, StepInputs
     from appearance_opt.initial.sphere import sphere
     from appearance_opt.reference.pool import Targets
-    from appearance_opt.render.deferred import Grid
-    from appearance_opt.render.gradient import Quality
+    from appearance_opt.render.pixels import Grid
+    from appearance_opt.render.quality import Quality
     from appearance_opt.views import ViewSampler
 
     flat = np.zeros((SIZE, SIZE), np.float32)

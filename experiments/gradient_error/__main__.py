@@ -23,7 +23,7 @@ import drjit as dr
 import numpy as np
 
 from appearance_opt import backend
-from appearance_opt.render.gradient import Quality
+from appearance_opt.render.quality import Quality
 from experiments import mitsuba_peer
 from experiments.gradient_error.estimators import Ours
 from experiments.gradient_error.metrics import error_of

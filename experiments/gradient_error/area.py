@@ -20,8 +20,8 @@ from appearance_opt.fit.model import POSITIONS, Model, Rates
 from appearance_opt.initial.sphere import sphere
 from appearance_opt.latent.latent import LatentMesh
 from appearance_opt.render import deferred, gradient, silhouette, silhouette_walk
-from appearance_opt.render.deferred import Grid
-from appearance_opt.render.gradient import Quality
+from appearance_opt.render.pixels import Grid
+from appearance_opt.render.quality import Quality
 from appearance_opt.views import ViewSampler
 from experiments.gradient_error.problems import split
 

@@ -13,8 +13,8 @@ from appearance_opt.fit.losses import LOSSES
 from appearance_opt.fit.model import POSITIONS, Model, Rates
 from appearance_opt.fit.step import Gradients, StepInputs
 from appearance_opt.reference.pool import Targets
-from appearance_opt.render.deferred import Grid
-from appearance_opt.render.gradient import Quality
+from appearance_opt.render.pixels import Grid
+from appearance_opt.render.quality import Quality
 from appearance_opt.render.surface import Surface
 from experiments.gradient_error.problems import BACKGROUND, Problem
 

@@ -22,8 +22,9 @@ from appearance_opt.fit.step import Gradients, StepInputs
 from appearance_opt.initial.sphere import sphere
 from appearance_opt.latent.texels import TexelCodec
 from appearance_opt.reference.pool import Targets
-from appearance_opt.render.deferred import Grid, render_image
-from appearance_opt.render.gradient import Quality
+from appearance_opt.render.deferred import render_image
+from appearance_opt.render.pixels import Grid
+from appearance_opt.render.quality import Quality
 from appearance_opt.views import ViewSampler
 from experiments.gradient_error.metrics import error_of
 from experiments.gradient_error.problems import BACKGROUND

@@ -9,7 +9,7 @@ from appearance_opt.config import CommonOptions, simplify_options
 from appearance_opt.fit.loop import FitOptions
 from appearance_opt.fit.model import Rates
 from appearance_opt.jobs import fitting, growth
-from appearance_opt.render.gradient import Quality
+from appearance_opt.render.quality import Quality
 
 
 @dataclass(frozen=True)
