@@ -134,7 +134,7 @@ def test_the_place_is_written(tmp_path: Path, suffix: str) -> None:
         assert nodes[-1]["translation"] == list(asset.origin)
 
 
-def test_the_frame_of_a_job_does_not_know_the_origin() -> None:
+def test_the_placement_of_a_job_does_not_know_the_origin() -> None:
     ball = make_asset(8, 16)
     far = replace(ball, origin=tuple(PLACE))
     near, moved = Placement().local(ball), Placement(tuple(PLACE)).local(far)

@@ -111,7 +111,7 @@ def test_a_sphere_over_a_coarse_one_has_known_normals_and_heights(low_sphere: As
     bitangent = np.cross(n, t) * hand[:, None]
     shaded = sum(maps[f"normal_{a}"][:, None] * v for a, v in zip("xyz", (t, bitangent, n), strict=True))
     shaded /= np.linalg.norm(shaded, axis=1, keepdims=True)
-    # the same normal through the shader's frame: only float32 in between (measured 0.04 degrees)
+    # the same normal through the shader's tangent basis: only float32 in between (measured 0.04 degrees)
     assert np.degrees(np.arccos(np.clip(np.sum(shaded * expected, axis=1), -1, 1))).max() < 0.1
 
 
@@ -171,7 +171,7 @@ def test_hard_edges_keep_their_normals_and_leave_no_gap() -> None:
     baked, mesh = baked_pair(low, low, "normal", "displacement")
     assert baked.missed.sum() == 0
     flat = np.stack([baked.maps[f"normal_{a}"] for a in "xyz"], axis=-1)
-    # the faces' own normals in their own frames: nothing to correct (measured 2e-7)
+    # the faces' own normals in their own bases: nothing to correct (measured 2e-7)
     np.testing.assert_allclose(flat, np.broadcast_to([0, 0, 1], flat.shape), atol=1e-5)
     _, _, along, normal, _, _ = texel_rays(mesh)
     assert np.sum(along * normal, axis=1).min() < 0.7  # rays fan out towards the corners

@@ -152,7 +152,7 @@ def test_vertices_read_the_mip_level_of_their_spacing() -> None:
 @pytest.mark.parametrize("level", [0, 1, 3])
 @pytest.mark.parametrize("of", [POSITIONS, DISPLACEMENT])
 def test_derivatives_of_the_displaced_surface(level: int, of: str) -> None:
-    """Positions, normals and tangent frames of the displaced mesh by base vertices and by texels."""
+    """Positions, normals and tangent bases of the displaced mesh by base vertices and by texels."""
     mesh = ball(48)
     tessellator = Tessellator(mesh, level, tangents=True)
     codec, stored = relief_of(smooth())

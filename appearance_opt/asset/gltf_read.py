@@ -159,7 +159,7 @@ class _Reader:
         return placed(local, place, name)
 
     def _read(self, primitive: dict[str, Any], source: _Source) -> Mesh:
-        """A primitive in its own frame, in double precision."""
+        """A primitive in its own coordinates, in double precision."""
         attributes, read = primitive["attributes"], source.read
         normals = tangents = colors = None
         if "NORMAL" in attributes:

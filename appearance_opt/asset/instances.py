@@ -1,4 +1,4 @@
-"""Meshes from their own frames to the places where a file puts them, all copies at once."""
+"""Meshes from their own coordinates to the places where a file puts them, all copies at once."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class Instances:
         return values if values is None or self.skinned or len(self.matrix) == 1 else np.tile(values, (self.copies, 1))
 
     def volumes(self) -> NDArray[np.float64]:
-        """How many times as large as in its own frame anything is at each place."""
+        """How many times as large as in its own coordinates anything is at each place."""
         return np.abs(np.linalg.det(self.matrix[:, :3, :3]))
 
     def mirrored(self, vertices: int) -> NDArray[np.bool_]:

@@ -1,4 +1,4 @@
-"""Tangent frames as MikkTSpace makes them (Mikkelsen 2008), vectorised."""
+"""Tangent bases as MikkTSpace makes them (Mikkelsen 2008), vectorised."""
 
 from __future__ import annotations
 

@@ -183,8 +183,8 @@ def _count_prims(stage: Any) -> int:
 
 @dataclass(frozen=True)
 class _Geometry:
-    """A mesh in its own frame. ``values``: positions ("points") and other attributes by name, each with faces of its
-    own; ``face_ids``: the file's face of each face; ``flipped``: do faces turn clockwise? ``holes``:
+    """A mesh in its own coordinates. ``values``: positions ("points") and other attributes by name, each with
+    faces of its own; ``face_ids``: the file's face of each face; ``flipped``: do faces turn clockwise? ``holes``:
     faces of the file that are not drawn."""
 
     values: dict[str, tuple[NDArray, Polygons]]
@@ -239,8 +239,9 @@ class _Reader:
         return Contents(tuple(found["Skeleton"]), tuple(clips), tuple(variants))
 
     def _to_world(self, prim: Any) -> Any:
-        """From a mesh's own frame to the world. A skinned one is kept at its bind pose, where its own transform does
-        not count (UsdSkel, "Skinning a Point"): its geomBindTransform leads into the frame of its skeleton."""
+        """From a mesh's own coordinates to the world. A skinned one is kept at its bind pose,
+        where its own transform does not count (UsdSkel, "Skinning a Point"): its geomBindTransform
+        leads to the coordinates of its skeleton."""
         from pxr import UsdSkel
 
         world = self.cache.GetLocalToWorldTransform(prim)
@@ -312,8 +313,8 @@ class _Reader:
         return Instances(metres @ np.asarray(to_world).transpose(0, 2, 1))
 
     def _parts(self, prim: Any) -> list[Mesh]:
-        """The triangles of a mesh or a shape in its own frame, in double precision, one mesh for each material. What
-        instances share is read once."""
+        """The triangles of a mesh or a shape in its own coordinates, in double precision, one mesh for
+        each material. What instances share is read once."""
         key = self._shared(prim)
         if key is None:
             return self._split(prim)
@@ -329,7 +330,7 @@ class _Reader:
         return str(prim.GetPrimInPrototype().GetPath()), *self.materials.bound_keys(prim)
 
     def _geometry(self, prim: Any) -> _Geometry | None:
-        """A mesh or a shape in its own frame; None, with a note, if it is something else."""
+        """A mesh or a shape in its own coordinates; None, with a note, if it is something else."""
         from pxr import UsdGeom
 
         flipped = str(UsdGeom.Gprim(prim).GetOrientationAttr().Get()) == "leftHanded"
@@ -462,7 +463,8 @@ class _Reader:
         return out
 
     def _split(self, prim: Any) -> list[Mesh]:
-        """Triangles with one index for all attributes, one mesh per material, in the frame of a mesh or a shape."""
+        """Triangles with one index for all attributes, one mesh per material, in the
+        coordinates of a mesh or a shape."""
         geometry = self._geometry(prim)
         if geometry is None:
             return []

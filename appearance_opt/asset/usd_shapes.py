@@ -29,7 +29,8 @@ Triangles = tuple["NDArray[np.float64]", "NDArray[np.float64]", "NDArray[np.int6
 
 
 def triangles(prim: Any, time: Any) -> Triangles | None:
-    """(positions (V, 3), unit normals (V, 3), faces (F, 3)) of a shape in its own frame; None if it is none of them."""
+    """(positions (V, 3), unit normals (V, 3), faces (F, 3)) of a shape in its own
+    coordinates; None if it is none of them."""
     make = _SHAPES.get(str(prim.GetTypeName()))
     if make is None:
         return None

@@ -219,7 +219,7 @@ def _counted(counts: NDArray) -> tuple[NDArray, NDArray]:
 
 
 def _turns(positions: NDArray, own: NDArray, leading: NDArray) -> NDArray[np.float64]:
-    """(F, 2, 2): what takes tangent-space x and y of the frames of one set of coordinates to those of another."""
+    """(F, 2, 2): what takes tangent-space x and y of one set of coordinates to those of another."""
     normal = np.cross(positions[:, 1] - positions[:, 0], positions[:, 2] - positions[:, 0])
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
     (t, b), (u, v) = (_tangents(positions, uv, normal) for uv in (own, leading))

@@ -42,7 +42,7 @@ FIELDS: dict[str, tuple[str, ...]] = {
 """What can be baked, and the channels of each."""
 
 FAR = 4.0
-"""Nothing lies farther than this in a frame in which the object has radius 1."""
+"""Nothing lies farther than this where the object has radius 1."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class Settings:
     """What to bake and how. ``fields``: names of ``FIELDS``. ``samples``: rays per texel. ``reach``: how far
     rays go outward and inward, None for the automatic cage. ``fill_hidden``: texels that nothing outside can see, or
     whose point of the reference nothing can see, are filled from their neighbours: where parts touch, two surfaces
-    coincide, and rays would find one or the other at random. Lengths in units of the frame."""
+    coincide, and rays would find one or the other at random. Lengths in local units."""
 
     size: int
     fields: tuple[str, ...] = ("material", "normal")
@@ -65,7 +65,7 @@ class Settings:
 @dataclass(frozen=True)
 class BakedMaps:
     """``maps``: channel name -> (size, size) float32, natural units (linear colours, normals in [-1, 1],
-    lengths in units of the frame), filled everywhere. ``covered``: texels that belong to a triangle of the
+    lengths in local units), filled everywhere. ``covered``: texels that belong to a triangle of the
     atlas. ``missed``: those among them whose rays found nothing. ``hidden``: those that nothing outside
     can see, if that was asked for (they do not count as missed). ``reach``: how far rays went."""
 
@@ -156,7 +156,7 @@ class _Run:
         out = exposed(self.points.scene, points.here.position, flat, all_, FAR, front_only)
         both = out & found.valid
         prim = dr.select(found.valid, found.triangle, 0)
-        position, geometric, _ = self.reference.frame_at(prim, found.b1, found.b2)
+        position, geometric, _ = self.reference.geometry_at(prim, found.b1, found.b2)
         front_only = _of(self.reference.surface.culled, prim)
         return ~out | (both & ~exposed(self.reference.scene, position, geometric, both, FAR, front_only))
 
@@ -170,7 +170,7 @@ class _Run:
             color = s.base_color
             normal = dr.select(dr.dot(s.normal, points.here.normal) < 0, -s.normal, s.normal)
             out["material"] = [color.x, color.y, color.z, s.roughness, s.metalness]
-            out["normal"] = in_frame_of(points.here, normal)
+            out["normal"] = to_tangent_space(points.here, normal)
             out["object-normal"] = [normal.x, normal.y, normal.z]
         out["displacement"] = [found.distance]
         if "ao" in fields:
@@ -190,8 +190,8 @@ def _of(culled: mi.Bool | None, triangle: mi.UInt32) -> mi.Bool | None:
     return None if culled is None else dr.gather(mi.Bool, culled, triangle)
 
 
-def in_frame_of(here: Hit, normal: mi.Vector3f) -> list[mi.Float]:
-    """A world-space normal in the shader's frame, whose tangent need not be perpendicular to the
+def to_tangent_space(here: Hit, normal: mi.Vector3f) -> list[mi.Float]:
+    """A world-space normal in the shader's tangent basis, whose tangent need not be perpendicular to the
     interpolated normal. It never points below the surface."""
     n, t = here.normal, here.tangent
     assert t is not None and here.handedness is not None

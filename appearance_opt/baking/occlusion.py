@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from appearance_opt.render.passing import Scene
 
 LIFT = 1e-4
-"""How far rays start above the surface, in units of the object's radius (1 in the frame of a bake)."""
+"""How far rays start above the surface, in units of the object's radius (1 in local units)."""
 
 TRIES = (1, 7, 24, 96)
 """Directions in which a way out is looked for, in several goes: most points see the sky along their normal, and only
@@ -34,7 +34,7 @@ def openness(
     Patterson 1976). ``far``: a distance beyond which there is nothing.
     """
     prim = dr.select(found.valid, found.triangle, 0)
-    position, geometric, normal = reference.frame_at(prim, found.b1, found.b2)
+    position, geometric, normal = reference.geometry_at(prim, found.b1, found.b2)
     tangent = dr.normalize(dr.cross(normal, dr.select(dr.abs(normal.x) < 0.9, mi.Vector3f(1, 0, 0), [0, 1, 0])))
     bitangent = dr.cross(normal, tangent)
     origin = dr.fma(geometric, LIFT, position)

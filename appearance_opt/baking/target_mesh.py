@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 @dataclass(frozen=True)
 class Low:
     """``asset``: the meshes as they are written, normals and, where no vertex must be split for them,
-    tangents completed. ``mesh``: all of them as one latent with fixed frames."""
+    tangents completed. ``mesh``: all of them as one latent with fixed tangents."""
 
     asset: Asset
     mesh: LatentMesh

@@ -43,7 +43,7 @@ class TexelPoints:
     """The atlas of a mesh as a flat scene, and the mesh under it.
 
     Rays follow the mesh's smooth normals, averaged over all faces at a place, so that no gap opens at a hard
-    edge; what they find is expressed in the mesh's own frames.
+    edge; what they find is expressed in the mesh's own tangent bases.
     """
 
     def __init__(self, mesh: LatentMesh, size: int, samples: int = 1) -> None:

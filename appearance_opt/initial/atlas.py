@@ -41,7 +41,7 @@ def charted(positions: NDArray, faces: NDArray, single: NDArray | None = None) -
     where such sheets lie back to back, each side gets vertices and charts of its own (see ``sheets``).
 
     glTF convention (v downward). Render vertices are also split where a vertex lies on charts of both
-    handednesses, so that each has one tangent frame.
+    handednesses, so that each has one tangent basis.
     """
     import xatlas
 

@@ -87,7 +87,7 @@ def decimate_with_source(
     the same sidedness. The count falls short of the budget by one or two at most, unless no legal
     collapse is left; no faces are returned if no collapse whatever reaches the budget.
     """
-    centre, scale = _frame(positions)
+    centre, scale = _centre_and_scale(positions)
     first, place = weld(np.asarray(positions))
     p = (np.asarray(positions, np.float64)[first] - centre) / scale
     f = place[np.asarray(faces)].astype(np.int64)
@@ -241,7 +241,7 @@ def _independent(state: State, edges: NDArray, rank: NDArray, limit: int, passes
     return np.concatenate(chosen)
 
 
-def _frame(positions: NDArray) -> tuple[NDArray, float]:
+def _centre_and_scale(positions: NDArray) -> tuple[NDArray, float]:
     """Centre and size: collapses are computed in a unit box, so that scale and offset do not matter."""
     p = np.asarray(positions, np.float64)
     low, high = p.min(axis=0), p.max(axis=0)

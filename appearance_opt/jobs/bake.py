@@ -156,7 +156,7 @@ def load_low(source: str | Path | Asset, options: BakeOptions) -> Asset:
 
 
 class BakeJob:
-    """Both assets in one frame; then the closed form, then the fit. ``high``: all of HIGH, where it was aligned;
+    """Both assets under one placement; then the closed form, then the fit. ``high``: all of HIGH, where it was aligned;
     ``low_parts``: what of LOW is baked onto, and what is left alone."""
 
     def __init__(
@@ -265,7 +265,7 @@ class BakeJob:
 
     @property
     def cage(self) -> float | None:
-        """``--cage`` in units of the frame; None for the automatic one."""
+        """``--cage`` in local units (see ``Placement``); None for the automatic one."""
         return None if self.options.cage is None else self.options.cage / self.placement.scale
 
     def _settings(self):

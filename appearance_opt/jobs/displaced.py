@@ -98,7 +98,7 @@ def bake_displacement(
     reference: MeshReference, mesh: LatentMesh, options: CommonOptions, reach: float | None = None
 ) -> tuple[LatentMesh, dict[str, NDArray[np.float32]]]:
     """Closed form: the displacement map that rays along the interpolated normals find within ``reach`` (None: the
-    automatic cage), and the mesh that it makes at the finest level, to whose frames the other maps belong."""
+    automatic cage), and the mesh that it makes at the finest level, to whose tangent bases the other maps belong."""
     size, level = map_size(mesh, options), max(options.levels())
     settings = Settings(size, (DISPLACEMENT,), samples=SAMPLES, reach=reach)
     found = bake(reference, mesh, settings).maps[DISPLACEMENT]

@@ -179,7 +179,7 @@ def load_init(options: SimplifyOptions) -> Asset | None:
 
 
 class _Job:
-    """The reference, its frame and the start; then the fit."""
+    """The reference, its placement and the start; then the fit."""
 
     def __init__(
         self,

@@ -30,7 +30,7 @@ DISPLACEMENT = "displacement"
 class Tessellator:
     """From base positions and a displacement map to the positions of one tessellation level.
 
-    ``topology``: connectivity of the tessellated mesh, which makes normals and tangent frames of the
+    ``topology``: connectivity of the tessellated mesh, which makes normals and tangent bases of the
     displaced surface. All else is precomputed: base vertices and weights of each vertex, where it reads
     the map and how finely.
     """

@@ -80,7 +80,7 @@ class LatentTopology:
         vertices = mesh_ops.packed_vertices(positions, normals)
         uv = dr.unravel(mi.Point2f, self.corners.uvs)
         if self.tangents:
-            t = mesh_ops.tangent_frames(positions, normals, self.corners)
+            t = mesh_ops.vertex_tangents(positions, normals, self.corners)
             frames = mesh_ops.interleave(uv.x, uv.y, self.handedness, mi.Float(0), t.x, t.y, t.z, mi.Float(0))
         else:
             frames = self.corners.uvs

@@ -1,4 +1,4 @@
-"""Differentiable operations on the latent mesh: normals and tangent frames of moving positions.
+"""Differentiable operations on the latent mesh: normals and tangent bases of moving positions.
 
 Each is a pure function of flat device buffers. The definitions are those of the exporter and of the
 closed-form transfer (``asset.normals``, ``asset.tangents``): angle-weighted vertex normals (Thuermer and
@@ -44,7 +44,7 @@ def vertex_normals(positions: mi.Float, corners: Corners) -> mi.Vector3f:
     return _direction(dr.unravel(mi.Vector3f, total), weight, mi.Vector3f(0))
 
 
-def tangent_frames(positions: mi.Float, normals: mi.Vector3f, corners: Corners) -> mi.Vector3f:
+def vertex_tangents(positions: mi.Float, normals: mi.Vector3f, corners: Corners) -> mi.Vector3f:
     """Unit tangents (R): per corner the direction of growing u, projected on the plane of the corner's
     vertex normal, normalised, weighted by the angle in that plane (MikkTSpace)."""
     p = [dr.gather(mi.Point3f, positions, i) for i in corners.vertex]

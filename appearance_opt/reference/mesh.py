@@ -158,7 +158,9 @@ class MeshReference:
             hit = interpolate_at(self.surface, triangle, b1, b2, area)
             return self.emission.layers[0].at(hit)[:3]
 
-    def frame_at(self, triangle: mi.UInt32, b1: mi.Float, b2: mi.Float) -> tuple[mi.Point3f, mi.Vector3f, mi.Vector3f]:
+    def geometry_at(
+        self, triangle: mi.UInt32, b1: mi.Float, b2: mi.Float
+    ) -> tuple[mi.Point3f, mi.Vector3f, mi.Vector3f]:
         """(position, normal of the triangle by its winding, interpolated vertex normal), the last turned to
         the side of the first; unit vectors."""
         with dr.suspend_grad():

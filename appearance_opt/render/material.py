@@ -86,7 +86,7 @@ def evaluate(maps: MaterialMaps, hit: Hit) -> MaterialSample:
 
 
 def shading_normal(hit: Hit, sample: MaterialSample) -> mi.Vector3f:
-    """World-space shading normal: the normal map in the hit's interpolated frame (glTF 2.0, 3.9.3)."""
+    """World-space shading normal: the normal map in the hit's interpolated tangent basis (glTF 2.0, 3.9.3)."""
     if sample.normal is None or hit.tangent is None:
         return hit.normal
     bitangent = dr.cross(hit.normal, hit.tangent) * hit.handedness

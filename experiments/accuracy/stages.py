@@ -121,7 +121,7 @@ def tone(one: Precision, two: Precision) -> list[Line]:
 
 
 def geometry(one: Precision, two: Precision) -> list[Line]:
-    """Normals and tangent frames of a rough sphere, and of one squeezed to slivers."""
+    """Normals and tangent bases of a rough sphere, and of one squeezed to slivers."""
     mesh = sphere(4000, (0.1, 0.2, 0.3), 0.7, 64)
     rng = np.random.default_rng(3)
     rough = mesh.positions + rng.normal(scale=0.005, size=mesh.positions.shape)
@@ -141,8 +141,8 @@ def geometry(one: Precision, two: Precision) -> list[Line]:
             )
             n = p.mesh_ops.vertex_normals(p.scalar(positions), c)
             normals.append(n)
-            tangents.append(p.mesh_ops.tangent_frames(p.scalar(positions), n, c))
-        out += [line("mesh_ops.vertex_normals", domain, *normals), line("mesh_ops.tangent_frames", domain, *tangents)]
+            tangents.append(p.mesh_ops.vertex_tangents(p.scalar(positions), n, c))
+        out += [line("mesh_ops.vertex_normals", domain, *normals), line("mesh_ops.vertex_tangents", domain, *tangents)]
     return out
 
 

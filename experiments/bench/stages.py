@@ -78,7 +78,7 @@ def stages(resolution: int, maps: int) -> dict[str, float]:
     timed("texels to mip pyramid", lambda: model.fitted_layer().pyramid.texels)
     positions = mi.Float(model.positions())
     dr.enable_grad(positions)
-    timed("normals and tangent frames", lambda: model.surface(positions).vertices)
+    timed("normals and tangent bases", lambda: model.surface(positions).vertices)
     surface, layer = model.surface(positions), model.fitted_layer()
     scene, all_maps = model.scene, model.maps(layer)
     loss, target = LOSSES["log-srgb-l1"], Target.of(reference, np.full((4, 3), 0.3))

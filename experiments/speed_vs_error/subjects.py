@@ -1,4 +1,5 @@
-"""What is simplified: assets in the frame of a fit, their held-out views, and their starts, made once and kept."""
+"""What is simplified: assets under the placement of a fit, their held-out views, and their starts,
+made once and kept."""
 
 from __future__ import annotations
 
