@@ -255,15 +255,15 @@ BAKE_OPTION_NAMES = frozenset(f.name for f in fields(BakeOptions))
 
 def simplify_options(preset: str = "default", **values: Any) -> SimplifyOptions:
     """Options from a preset and what overrides it. Raises InputError for unknown names and bad values."""
-    return SimplifyOptions(**_merged(SimplifyOptions, OPTION_NAMES, preset, values))
+    return SimplifyOptions(**_merge(SimplifyOptions, OPTION_NAMES, preset, values))
 
 
 def bake_options(preset: str = "default", **values: Any) -> BakeOptions:
     """The same for a bake."""
-    return BakeOptions(**_merged(BakeOptions, BAKE_OPTION_NAMES, preset, values))
+    return BakeOptions(**_merge(BakeOptions, BAKE_OPTION_NAMES, preset, values))
 
 
-def _merged(kind: type, known: frozenset[str], preset: str, values: Mapping[str, Any]) -> dict[str, Any]:
+def _merge(kind: type, known: frozenset[str], preset: str, values: Mapping[str, Any]) -> dict[str, Any]:
     _choice("preset", preset, tuple(PRESETS))
     for name in values:
         if name not in known:
@@ -272,7 +272,7 @@ def _merged(kind: type, known: frozenset[str], preset: str, values: Mapping[str,
     # an explicit number of steps replaces the preset's time budget
     if values.get("steps") is not None and "budget" not in values:
         merged["budget"] = None
-    return {k: _converted(kind, k, v) for k, v in merged.items()}
+    return {k: _convert(kind, k, v) for k, v in merged.items()}
 
 
 def read_toml(path: Path, names: frozenset[str] = OPTION_NAMES) -> dict[str, Any]:
@@ -318,7 +318,7 @@ def with_values(options: SimplifyOptions, **values: Any) -> SimplifyOptions:
     return replace(options, **values)
 
 
-def _converted(kind: type, name: str, value: Any) -> Any:
+def _convert(kind: type, name: str, value: Any) -> Any:
     if name == "budget" and value is not None:
         return duration(value)
     if name in ("fit", "maps"):

@@ -19,7 +19,7 @@ from appearance_opt.baking.check import overlap
 from appearance_opt.baking.closed_form import BakedMaps, Settings
 from appearance_opt.baking.closed_form import bake as closed_form
 from appearance_opt.baking.curvature import mean_curvature
-from appearance_opt.baking.target_mesh import prepare, unwrapped
+from appearance_opt.baking.target_mesh import prepare, unwrap_asset
 from appearance_opt.baking.texel_points import TexelPoints
 from appearance_opt.config import bake_options, read_toml
 from appearance_opt.errors import InputError
@@ -287,7 +287,7 @@ def test_align_finds_scale_and_place(ball: Asset, low_sphere: Asset) -> None:
 
 def test_unwrap_gives_an_atlas_and_keeps_faces() -> None:
     low = Asset((replace(cube(), uvs=None), replace(cube(), uvs=None, positions=cube().positions + 2)), "low")
-    out = unwrapped(low, SIZE)
+    out = unwrap_asset(low, SIZE)
     for a, b in zip(low.meshes, out.meshes, strict=True):
         np.testing.assert_array_equal(a.positions[a.faces], b.positions[b.faces])
         np.testing.assert_array_equal(a.normals[a.faces], b.normals[b.faces])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from appearance_opt.initial.clustering import clustered
+from appearance_opt.initial.clustering import cluster
 from appearance_opt.jobs.start import LEAST_CLUSTERS, is_coarse
 from tests.conftest import grid_sphere
 
@@ -35,20 +35,20 @@ def normals(p: np.ndarray, f: np.ndarray) -> np.ndarray:
 
 
 def test_flat_and_round_surfaces_stay_where_they_are() -> None:
-    p, f, source = clustered(*grid(120), 400)
+    p, f, source = cluster(*grid(120), 400)
     assert 100 < len(p) < 800
     assert np.abs(p[:, 2]).max() < 1e-12
     assert (normals(p, f)[:, 2] > 0).mean() > 0.99  # a cell's vertex may lie beyond its neighbour's
     assert len(source) == len(f) and (np.diff(source) > 0).all()
     sphere, faces, _ = grid_sphere(100, 200)
-    p, f, _ = clustered(sphere, faces, 2000)
+    p, f, _ = cluster(sphere, faces, 2000)
     assert 500 < len(p) < 4000
     assert np.abs(np.linalg.norm(p, axis=1) - 1).max() < 0.01
     assert (np.sum(normals(p, f) * p[f].mean(axis=1), axis=1) > 0).mean() > 0.99
 
 
 def test_sharp_edges_are_kept_to_a_part_of_a_cell() -> None:
-    p = clustered(*box(80), 1500)[0]
+    p = cluster(*box(80), 1500)[0]
     cell = (1.5 * 6 / 1500) ** 0.5
     outside = np.abs(p - 0.5).max(axis=1) - 0.5
     assert np.abs(outside).max() < 0.1 * cell  # every vertex lies on the cube
@@ -59,19 +59,19 @@ def test_sharp_edges_are_kept_to_a_part_of_a_cell() -> None:
 def test_both_sides_of_a_sheet_are_kept_and_copies_are_one() -> None:
     p, f = grid(60)
     both = np.concatenate([f, f[:, ::-1]])
-    _, faces, source = clustered(p, both, 200)
+    _, faces, source = cluster(p, both, 200)
     front, back = source < len(f), source >= len(f)
     assert front.sum() == back.sum() == len(faces) / 2
-    _, twice, _ = clustered(p, np.concatenate([f, f]), 200)
+    _, twice, _ = cluster(p, np.concatenate([f, f]), 200)
     assert len(twice) == front.sum()
 
 
 def test_coarse_meshes_do_not_change_and_tiny_ones_do_not_fail() -> None:
     p, f = grid(3)
-    q, g, source = clustered(p, f, 10_000)
+    q, g, source = cluster(p, f, 10_000)
     np.testing.assert_allclose(np.sort(q, axis=0), np.sort(p, axis=0), atol=1e-12)
     assert len(g) == len(f) == len(source)
-    one, _, _ = clustered(np.zeros((3, 3)), np.array([[0, 1, 2]]), 10)
+    one, _, _ = cluster(np.zeros((3, 3)), np.array([[0, 1, 2]]), 10)
     assert len(one) == 0  # all at one place
 
 

@@ -15,7 +15,7 @@ from appearance_opt.asset.creases import shaded, smooth_by_angle, split
 from appearance_opt.asset.edges import Edges
 from appearance_opt.asset.normals import unit, vertex_normals
 from appearance_opt.asset.types import Asset, Mesh, srgb_to_linear
-from appearance_opt.baking.target_mesh import movable, unwrapped
+from appearance_opt.baking.target_mesh import movable, unwrap_asset
 from appearance_opt.errors import InputError
 from appearance_opt.initial.decimate import decimate
 from appearance_opt.jobs.simplify import load_source
@@ -216,7 +216,7 @@ def test_hard_edges_do_not_tear_a_mesh() -> None:
     again = trimesh.Trimesh(positions, faces, process=False)
     assert again.is_watertight
     np.testing.assert_allclose(again.volume, 1, rtol=0.1)
-    laid = unwrapped(Asset((mesh,), "x"), 64).meshes[0]
+    laid = unwrap_asset(Asset((mesh,), "x"), 64).meshes[0]
     corners = np.arange(len(laid.positions), dtype=np.int32)
     latent = LatentMesh(laid.positions, laid.faces, corners, laid.faces, laid.uvs, laid.normals, None)
     assert len(movable(latent).positions) == len(whole.positions)

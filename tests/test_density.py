@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from appearance_opt.baking.texel_points import TexelPoints, texel_coverage
-from appearance_opt.initial.atlas import charted, charts_of, packed, unwrap, uv_areas
-from appearance_opt.initial.density import LARGEST, SMALLEST, chart_scales, halved
+from appearance_opt.initial.atlas import charts_of, make_charts, pack_charts, unwrap, uv_areas
+from appearance_opt.initial.density import LARGEST, SMALLEST, chart_scales, halve
 from appearance_opt.initial.sphere import sphere
 from appearance_opt.latent.latent import LatentMesh
 from appearance_opt.views import ViewSampler
@@ -24,7 +24,7 @@ def areas(mesh: LatentMesh) -> NDArray[np.float64]:
 
 
 def test_charts_are_as_large_as_what_they_stand_for() -> None:
-    charts = charted(5 * BALL.positions + 3, BALL.faces)
+    charts = make_charts(5 * BALL.positions + 3, BALL.faces)
     np.testing.assert_array_equal(charts.frame_vertex[charts.frame_faces], BALL.faces)
     # in units of the box's longest side, which is 2 of the ball's radii; charts of a sphere are stretched a little
     assert uv_areas(charts).sum() == pytest.approx(areas(BALL).sum() / 4, rel=0.1)
@@ -39,11 +39,11 @@ def test_charts_are_as_large_as_what_they_stand_for() -> None:
 
 @pytest.mark.parametrize("tight", [False, True])
 def test_scaled_charts_get_more_texels_and_do_not_overlap(tight: bool) -> None:
-    charts = charted(BALL.positions, BALL.faces)
+    charts = make_charts(BALL.positions, BALL.faces)
     label = charts_of(charts)
     large = label % 2 == 0
-    even = packed(charts, np.ones(len(label)), SIZE, tight=tight)
-    mesh = packed(charts, np.where(large, 2.0, 1.0), SIZE, tight=tight)
+    even = pack_charts(charts, np.ones(len(label)), SIZE, tight=tight)
+    mesh = pack_charts(charts, np.where(large, 2.0, 1.0), SIZE, tight=tight)
     np.testing.assert_array_equal(mesh.frame_vertex[mesh.frame_faces], BALL.faces)
     assert mesh.uvs.min() >= 0 and mesh.uvs.max() <= 1
     gain = uv_areas(mesh) / uv_areas(even)
@@ -56,8 +56,8 @@ def test_scaled_charts_get_more_texels_and_do_not_overlap(tight: bool) -> None:
 @pytest.mark.parametrize("gutter", [4, 8])
 @pytest.mark.parametrize("tight", [False, True])
 def test_charts_are_as_far_apart_as_they_are_meant_to_be(gutter: int, tight: bool) -> None:
-    charts = charted(BALL.positions, BALL.faces)
-    mesh = packed(charts, np.ones(len(BALL.faces)), SIZE, gutter, tight)
+    charts = make_charts(BALL.positions, BALL.faces)
+    mesh = pack_charts(charts, np.ones(len(BALL.faces)), SIZE, gutter, tight)
     points = TexelPoints(mesh, SIZE).band(0, 0.5, 0.5)
     assert points is not None
     chart = np.full(SIZE * SIZE, -1)
@@ -115,6 +115,6 @@ def test_texels_go_where_they_are_seen_to_be_missing() -> None:
 
 def test_half_resolution_keeps_what_is_smooth() -> None:
     ramp = np.add.outer(np.arange(8.0), 2 * np.arange(12.0)).astype(np.float32)
-    np.testing.assert_allclose(halved(ramp)[1:-1, 1:-1], ramp[1:-1, 1:-1], atol=1e-5)
+    np.testing.assert_allclose(halve(ramp)[1:-1, 1:-1], ramp[1:-1, 1:-1], atol=1e-5)
     checks = (np.indices((8, 12)).sum(axis=0) % 2).astype(np.float32)
-    np.testing.assert_allclose(halved(checks), 0.5, atol=1e-6)
+    np.testing.assert_allclose(halve(checks), 0.5, atol=1e-6)

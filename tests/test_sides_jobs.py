@@ -15,9 +15,9 @@ from appearance_opt import simplify, simplify_options
 from appearance_opt.asset import load, save
 from appearance_opt.asset.types import Asset, Material, Mesh, Texture
 from appearance_opt.baking.target_mesh import movable
-from appearance_opt.initial.atlas import charted, charts_of, unwrap
+from appearance_opt.initial.atlas import charts_of, make_charts, unwrap
 from appearance_opt.initial.decimate import decimate_with_source
-from appearance_opt.initial.sheets import separated
+from appearance_opt.initial.sheets import separate
 from appearance_opt.jobs.compare import compare
 from appearance_opt.latent.export import to_asset
 from appearance_opt.latent.latent import LatentMesh
@@ -85,13 +85,13 @@ def test_sides_of_a_sheet_share_neither_vertices_nor_charts() -> None:
     p, f = sheet()
     faces = np.concatenate([f, f[:, ::-1]])
     single = np.ones(len(faces), bool)
-    out = separated(p, faces, single)
+    out = separate(p, faces, single)
     assert len(out.positions) == 2 * len(p)
     front = np.arange(len(faces)) < len(f)
     assert not np.intersect1d(out.faces[front], out.faces[~front]).size
     np.testing.assert_array_equal(out.positions[out.faces], p[faces])
     assert out.behind[front].all() != out.behind[~front].all()
-    mesh = charted(p, faces, single)
+    mesh = make_charts(p, faces, single)
     chart = charts_of(mesh)
     assert not np.intersect1d(chart[front], chart[~front]).size
     np.testing.assert_array_equal(mesh.positions[mesh.faces], p[faces].astype(np.float32))
@@ -116,12 +116,12 @@ def test_meshes_that_are_baked_onto_keep_their_sides_apart(shared: bool) -> None
 def test_other_surfaces_stay_in_one_piece() -> None:
     for p, f in (ball(), (ball()[0], ball()[1][20:]), sheet()):
         single = np.ones(len(f), bool)
-        assert separated(p, f, single).positions is p
-        assert separated(p, f, None).positions is p
+        assert separate(p, f, single).positions is p
+        assert separate(p, f, None).positions is p
     # double-sided sheets back to back are for the stacks to sort out
     p, f = sheet()
     faces = np.concatenate([f, f[:, ::-1]])
-    assert separated(p, faces, np.zeros(len(faces), bool)).positions is p
+    assert separate(p, faces, np.zeros(len(faces), bool)).positions is p
 
 
 def test_borders_between_sides_are_held() -> None:

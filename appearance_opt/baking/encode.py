@@ -26,12 +26,12 @@ CURVATURE_QUANTILE = 0.99
 """Share of the texels whose curvature must not clip."""
 
 
-def stacked(maps: Mapping[str, NDArray], *names: str) -> NDArray[np.float32]:
+def stack_maps(maps: Mapping[str, NDArray], *names: str) -> NDArray[np.float32]:
     """(H, W, C) of some channels."""
     return np.stack([maps[n] for n in names], axis=-1).astype(np.float32)
 
 
-def quantised(values: NDArray, bits: int) -> NDArray:
+def quantise(values: NDArray, bits: int) -> NDArray:
     """[0, 1] to uint8 or uint16."""
     top, kind = (255, np.uint8) if bits == 8 else (65535, np.uint16)
     return (np.clip(values, 0, 1) * top + 0.5).astype(kind)
@@ -39,7 +39,7 @@ def quantised(values: NDArray, bits: int) -> NDArray:
 
 def normal_image(maps: Mapping[str, NDArray], prefix: str = "normal", flip_green: bool = False) -> NDArray[np.float32]:
     """(H, W, 3) unit normals as (n + 1) / 2."""
-    n = stacked(maps, *(f"{prefix}_{axis}" for axis in "xyz"))
+    n = stack_maps(maps, *(f"{prefix}_{axis}" for axis in "xyz"))
     n /= np.maximum(np.linalg.norm(n, axis=-1, keepdims=True), 1e-6)
     if flip_green:
         n[..., 1] *= -1
@@ -65,19 +65,19 @@ def material_change(
     HIGH?"""
     new: dict[str, Any] = {}
     if options.wants("base-color"):
-        color = linear_to_srgb(np.clip(stacked(maps, "red", "green", "blue"), 0, 1))
-        texture = Texture(quantised(color, 8), "srgb", CLAMP)
+        color = linear_to_srgb(np.clip(stack_maps(maps, "red", "green", "blue"), 0, 1))
+        texture = Texture(quantise(color, 8), "srgb", CLAMP)
         new |= {"base_color": (1.0, 1.0, 1.0), "base_color_texture": texture, "unlit": unlit}
     if options.wants("orm"):
-        orm = Texture(quantised(orm_image(maps), 8), "linear", CLAMP)
+        orm = Texture(quantise(orm_image(maps), 8), "linear", CLAMP)
         new |= {"roughness": 1.0, "metalness": 1.0, "orm_texture": orm, "has_occlusion": "occlusion" in maps}
     if options.wants("normal"):
         new |= {
             "normal_scale": 1.0,
-            "normal_texture": Texture(quantised(normal_image(maps), options.bits), "linear", CLAMP),
+            "normal_texture": Texture(quantise(normal_image(maps), options.bits), "linear", CLAMP),
         }
     if EMISSION[0] in maps:
-        emission, glow = pack_emission(stacked(maps, *EMISSION))
+        emission, glow = pack_emission(stack_maps(maps, *EMISSION))
         new |= {"emission": emission, "emission_texture": glow}
     if options.wants("displacement"):
         new["displacement"] = displacement_of(maps["displacement"])
@@ -103,7 +103,7 @@ class LooseMap:
         if suffix == "exr":
             return images.encode_exr(self.pixels)
         shown = linear_to_srgb(np.clip(self.pixels, 0, 1)) if self.srgb else self.pixels
-        return images.encode_png(quantised(shown, bits))
+        return images.encode_png(quantise(shown, bits))
 
 
 def loose_files(
@@ -142,7 +142,7 @@ HEIGHT = "scale * (texel - mid_level)"
 def _loose_maps(maps: Mapping[str, NDArray], covered: NDArray, options: BakeOptions) -> Iterator[LooseMap]:
     """The maps asked for, but the displacement."""
     if options.wants("base-color"):
-        yield LooseMap("base-color", stacked(maps, "red", "green", "blue"), srgb=True)
+        yield LooseMap("base-color", stack_maps(maps, "red", "green", "blue"), srgb=True)
     if options.wants("orm"):
         yield LooseMap("orm", orm_image(maps), facts={"channels": "occlusion, roughness, metalness"})
     unit = {"encoding": "(n + 1) / 2"}
@@ -152,15 +152,15 @@ def _loose_maps(maps: Mapping[str, NDArray], covered: NDArray, options: BakeOpti
     if options.wants("object-normal"):
         yield LooseMap("object-normal", normal_image(maps, "object"), facts={"space": "object, +Y up", **unit})
     if EMISSION[0] in maps:
-        pixels = stacked(maps, *EMISSION)
+        pixels = stack_maps(maps, *EMISSION)
         yield LooseMap("emission", pixels, srgb=True)
     if options.wants("ao"):
-        yield LooseMap("ao", stacked(maps, "occlusion"), facts={"encoding": "1: open, 0: occluded"})
+        yield LooseMap("ao", stack_maps(maps, "occlusion"), facts={"encoding": "1: open, 0: occluded"})
     if options.wants("curvature"):
         exr = options.texture_format == "exr"
         scale, mid = (1.0, 0.0) if exr else (2 * curvature_scale(maps, covered), 0.5)
         facts = {"unit": "1 / metre", "value": HEIGHT, "scale": scale, "mid_level": mid}
-        yield LooseMap("curvature", stacked(maps, "curvature") / np.float32(scale) + np.float32(mid), facts=facts)
+        yield LooseMap("curvature", stack_maps(maps, "curvature") / np.float32(scale) + np.float32(mid), facts=facts)
 
 
 def coverage_picture(covered: NDArray, missed: NDArray) -> NDArray[np.uint8]:

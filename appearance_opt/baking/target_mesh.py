@@ -11,7 +11,7 @@ from appearance_opt.asset.normals import vertex_normals, weld
 from appearance_opt.asset.sides import single_sided
 from appearance_opt.asset.tangents import split_and_tangents
 from appearance_opt.asset.types import Asset, Material
-from appearance_opt.initial.sheets import separated
+from appearance_opt.initial.sheets import separate
 from appearance_opt.latent.latent import LatentMesh
 
 if TYPE_CHECKING:
@@ -60,7 +60,7 @@ def movable(mesh: LatentMesh) -> LatentMesh:
     coordinates stay; normals follow from the shape from now on."""
     first, place = weld(mesh.positions)
     welded = place[mesh.faces].astype(np.int32)
-    sheets = separated(mesh.positions[first], welded, mesh.single)
+    sheets = separate(mesh.positions[first], welded, mesh.single)
     positions, faces, vertex = sheets.positions, sheets.faces, place[mesh.frame_vertex].astype(np.int32)
     vertex[mesh.frame_faces] = faces
     if not np.array_equal(vertex[mesh.frame_faces], faces):
@@ -75,7 +75,7 @@ def movable(mesh: LatentMesh) -> LatentMesh:
     )
 
 
-def unwrapped(asset: Asset, size: int) -> Asset:
+def unwrap_asset(asset: Asset, size: int) -> Asset:
     """The asset with new texture coordinates: charts of all meshes packed into one square for ``size``
     texels. Vertices are split at chart borders; faces and normals stay."""
     from appearance_opt.initial.atlas import unwrap

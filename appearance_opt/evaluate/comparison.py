@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from appearance_opt.errors import InputError
 from appearance_opt.evaluate.metrics import compare_images
 from appearance_opt.reference.mesh import MeshReference
-from appearance_opt.reference.pool import checked
+from appearance_opt.reference.pool import check_images
 
 if TYPE_CHECKING:
     import numpy as np
@@ -48,4 +48,4 @@ def compare_local(
 
 def render_asset(asset: Asset, views: Views, resolution: int, samples: int) -> NDArray[np.float32]:
     """Images (B, H, W, 4) of an asset; the device memory of its textures is released afterwards."""
-    return checked(MeshReference(asset).render(views, resolution, samples), len(views), resolution, asset.name)
+    return check_images(MeshReference(asset).render(views, resolution, samples), len(views), resolution, asset.name)

@@ -42,11 +42,11 @@ def texture_pictures(asset: Asset) -> dict[str, NDArray[np.uint8]]:
     for name, texture in named.items():
         if texture is not None:
             pixels = texture.pixels[..., :3]
-            out[name] = pixels if pixels.dtype == np.uint8 else _bytes(_encoded(texture.linear()[..., :3], name))
+            out[name] = pixels if pixels.dtype == np.uint8 else _bytes(_encode(texture.linear()[..., :3], name))
     return out
 
 
-def _encoded(linear: NDArray, name: str) -> NDArray:
+def _encode(linear: NDArray, name: str) -> NDArray:
     return linear_to_srgb(np.clip(linear, 0, 1)) if name == "base colour" else linear
 
 

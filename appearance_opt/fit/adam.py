@@ -53,7 +53,7 @@ def update(parameter: Parameter, gradient: mi.Float, moments: Moments, rate: flo
     else:
         # one scale for all: a scale per element would undo the smoothness (Nicolet et al. 2021, section 4.3)
         step = parameter.smooth(first * scale / (dr.sqrt(dr.max(second) * correction) + EPSILON))
-    value = _bounded(parameter, parameter.value - _rates(parameter) * step)
+    value = _clamp_to_bounds(parameter, parameter.value - _rates(parameter) * step)
     share = dr.opaque(mi.Float, (AVERAGING + 1) / (steps + AVERAGING))
     mean = dr.fma(value - moments.mean, share, moments.mean)
     dr.eval(value, first, second, mean)
@@ -67,7 +67,7 @@ def _rates(parameter: Parameter) -> mi.Float:
     return dr.gather(mi.Float, parameter.rate, _channel(parameter))
 
 
-def _bounded(parameter: Parameter, value: mi.Float) -> mi.Float:
+def _clamp_to_bounds(parameter: Parameter, value: mi.Float) -> mi.Float:
     if parameter.low is None or parameter.high is None:
         return value
     channel = _channel(parameter)

@@ -43,7 +43,7 @@ def write(path: Path, fingerprint: str, value: object) -> None:
     identifies the job. ``value``: None, numbers, text, arrays, and tuples, lists, dictionaries with text as keys and
     dataclasses of such; every field is kept. Raises TypeError for anything else."""
     arrays: dict[str, NDArray] = {}
-    head = {"format": FORMAT, "fingerprint": fingerprint, "value": _described(value, "value", arrays)}
+    head = {"format": FORMAT, "fingerprint": fingerprint, "value": _describe(value, "value", arrays)}
     handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.stem}-", suffix=TEMPORARY)
     try:
         with os.fdopen(handle, "wb") as file:
@@ -80,7 +80,7 @@ def read(path: Path, fingerprint: str, classes: Iterable[type], convert: Callabl
     known = {c.__name__: c for c in classes}
     try:
         with zipfile.ZipFile(path) as packed:
-            return _built(head["value"], packed, known, convert or (lambda array: array))
+            return _rebuild(head["value"], packed, known, convert or (lambda array: array))
     except _UNREADABLE as error:
         raise DamagedError(f"{error or type(error).__name__}") from error
 
@@ -122,7 +122,7 @@ def _array(data: bytes) -> NDArray:
     return np.frombuffer(data, kind, offset=stream.tell()).reshape(shape, order="F" if fortran else "C").copy()
 
 
-def _described(value: Any, name: str, arrays: dict[str, NDArray]) -> Any:
+def _describe(value: Any, name: str, arrays: dict[str, NDArray]) -> Any:
     """A description of a value in JSON; its arrays go into ``arrays``, named after their place in it."""
     if isinstance(value, np.generic):
         value = value.item()
@@ -131,12 +131,12 @@ def _described(value: Any, name: str, arrays: dict[str, NDArray]) -> Any:
     if isinstance(value, float):
         return {"number": repr(value)}  # JSON has no infinity
     if is_dataclass(value) and not isinstance(value, type):
-        parts = {f.name: _described(getattr(value, f.name), f"{name}/{f.name}", arrays) for f in fields(value)}
+        parts = {f.name: _describe(getattr(value, f.name), f"{name}/{f.name}", arrays) for f in fields(value)}
         return {"class": type(value).__name__, "fields": parts}
     if isinstance(value, dict) and all(isinstance(k, str) for k in value):
-        return {"dictionary": {k: _described(v, f"{name}/{k}", arrays) for k, v in value.items()}}
+        return {"dictionary": {k: _describe(v, f"{name}/{k}", arrays) for k, v in value.items()}}
     if isinstance(value, (tuple, list)):
-        return {type(value).__name__: [_described(v, f"{name}/{k}", arrays) for k, v in enumerate(value)]}
+        return {type(value).__name__: [_describe(v, f"{name}/{k}", arrays) for k, v in enumerate(value)]}
     array = np.asarray(value)  # a Dr.Jit array, too
     if array.dtype.kind not in "biuf":
         raise TypeError(f"{name}: a {type(value).__name__} cannot be kept")
@@ -144,12 +144,14 @@ def _described(value: Any, name: str, arrays: dict[str, NDArray]) -> Any:
     return {"array": name}
 
 
-def _built(described: Any, packed: zipfile.ZipFile, classes: dict[str, type], convert: Callable[[NDArray], Any]) -> Any:
+def _rebuild(
+    described: Any, packed: zipfile.ZipFile, classes: dict[str, type], convert: Callable[[NDArray], Any]
+) -> Any:
     if not isinstance(described, dict):
         return described
 
     def built(x: Any) -> Any:
-        return _built(x, packed, classes, convert)
+        return _rebuild(x, packed, classes, convert)
 
     if "class" in described:
         kind = classes[described["class"]]

@@ -132,7 +132,7 @@ class Target:
 def covered_loss(loss: Loss, target: Target, color: mi.Color3f, pixel: mi.UInt32) -> mi.Float:
     """Share of the mean loss of a batch that falls on fully covered pixels of radiance ``color``, one value per
     pixel, differentiable."""
-    return _summed(loss(color, target.colors(pixel)[0])) * target.share
+    return _sum_channels(loss(color, target.colors(pixel)[0])) * target.share
 
 
 def compared_pixels(image: mi.Float, target: Target, complete: mi.Bool | None = None) -> mi.UInt32:
@@ -150,14 +150,14 @@ def image_loss(loss: Loss, target: Target, image: mi.Float, pixels: mi.UInt32, t
     value = dr.gather(mi.ArrayXf, dr.detach(image), pixels, shape=(4, dr.width(pixels)))
     dr.enable_grad(value)
     reference, behind = target.colors(pixels)
-    share = _summed(loss(_over(value, behind), reference)) * target.share
+    share = _sum_channels(loss(_over(value, behind), reference)) * target.share
     backward([share])
     gradient = dr.zeros(mi.Float, total * 4)
     dr.scatter(gradient, dr.grad(value), pixels, mode=dr.ReduceMode.Permute)
     return dr.detach(share), gradient
 
 
-def _summed(color: mi.Color3f) -> mi.Float:
+def _sum_channels(color: mi.Color3f) -> mi.Float:
     return color.x + color.y + color.z
 
 

@@ -210,8 +210,8 @@ class Model:
         if POSITIONS in self.parameters:
             dr.enable_grad(positions)
         if DISPLACEMENT in self.parameters and relief is not None:
-            relief = _tracked(relief)
-        return Shape(positions, relief), None if layer is None else _tracked(layer)
+            relief = _track(relief)
+        return Shape(positions, relief), None if layer is None else _track(layer)
 
     def gradients(self, shape: Shape, layer: TexelLayer | None, values: Mapping[str, mi.Float]) -> dict[str, mi.Float]:
         """Gradients of the parameters, which have the given ``values``, after the backward pass of a tracked shape
@@ -300,7 +300,7 @@ class Model:
         self.update_scene()
 
 
-def _tracked(layer: TexelLayer) -> TexelLayer:
+def _track(layer: TexelLayer) -> TexelLayer:
     """A copy whose texels carry gradients."""
     texels = mi.Float(layer.pyramid.texels)
     dr.enable_grad(texels)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from appearance_opt.errors import DivergedError
-from appearance_opt.reference.pool import checked
+from appearance_opt.reference.pool import check_images
 from appearance_opt.render.deferred import render_image
 from appearance_opt.render.display import display
 from appearance_opt.render.pixels import Grid
@@ -26,7 +26,7 @@ class Validation:
     def __init__(self, reference: Reference, views: Views, resolution: int, samples: int = 9) -> None:
         self.views, self.resolution, self.samples = views, resolution, samples
         self._grid = Grid(len(views), resolution)
-        images = checked(reference.render(views, resolution, samples), len(views), resolution, "held-out views")
+        images = check_images(reference.render(views, resolution, samples), len(views), resolution, "held-out views")
         self._reference = display(images)
         self._covered = images[..., 3] > 0
 

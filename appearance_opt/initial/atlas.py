@@ -9,7 +9,7 @@ import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from appearance_opt.initial.sheets import separated
+from appearance_opt.initial.sheets import separate
 from appearance_opt.latent.latent import LatentMesh
 
 if TYPE_CHECKING:
@@ -32,10 +32,10 @@ def unwrap(
     positions: NDArray, faces: NDArray, resolution: int, gutter: int = GUTTER, single: NDArray | None = None
 ) -> LatentMesh:
     """Charts for all faces, with equally many texels per area, packed for a texture of ``resolution`` texels."""
-    return packed(charted(positions, faces, single), np.ones(len(faces)), resolution, gutter)
+    return pack_charts(make_charts(positions, faces, single), np.ones(len(faces)), resolution, gutter)
 
 
-def charted(positions: NDArray, faces: NDArray, single: NDArray | None = None) -> LatentMesh:
+def make_charts(positions: NDArray, faces: NDArray, single: NDArray | None = None) -> LatentMesh:
     """Charts for all faces. UVs are as long as what they stand for (in units of the longest side of the mesh's box),
     and charts lie side by side, anywhere. ``single`` (F,): faces that are seen from their front only, None for none;
     where such sheets lie back to back, each side gets vertices and charts of its own (see ``sheets``).
@@ -48,7 +48,7 @@ def charted(positions: NDArray, faces: NDArray, single: NDArray | None = None) -
     # xatlas welds and measures with absolute thresholds: give it a unit-sized object
     centre = (positions.min(axis=0) + positions.max(axis=0)) / 2
     scale = max(float(np.ptp(positions, axis=0).max()), 1e-300)
-    sheets = separated(positions, faces, single)
+    sheets = separate(positions, faces, single)
     atlas = xatlas.Atlas()
     unit = ((sheets.positions - centre) / scale).astype(np.float32)
     # vertices at one place are one to xatlas: what lies back to back is a mesh of its own
@@ -59,7 +59,7 @@ def charted(positions: NDArray, faces: NDArray, single: NDArray | None = None) -
     chart = xatlas.ChartOptions()
     chart.max_iterations = 2
     atlas.generate(chart_options=chart, pack_options=_pack_options(1024, GUTTER, 0.0))
-    vertex, frames, uvs = _joined(atlas, parts)
+    vertex, frames, uvs = _join(atlas, parts)
     # xatlas stretches the texture, which is as wide and high as it likes, to the unit square
     side = np.array([atlas.width, atlas.height], np.float32) / np.float32(max(atlas.texels_per_unit, 1e-30))
     charts = LatentMesh(
@@ -103,7 +103,7 @@ def _with_single_faces(charts: LatentMesh, left: NDArray[np.bool_], positions: N
     )
 
 
-def _joined(atlas: xatlas.Atlas, parts: list[NDArray]) -> tuple[NDArray, NDArray, NDArray]:
+def _join(atlas: xatlas.Atlas, parts: list[NDArray]) -> tuple[NDArray, NDArray, NDArray]:
     """(vertex of each render vertex, faces, UVs) of all meshes of an atlas, the faces at the numbers ``parts``."""
     if len(parts) == 1:
         return atlas[0]
@@ -115,10 +115,10 @@ def _joined(atlas: xatlas.Atlas, parts: list[NDArray]) -> tuple[NDArray, NDArray
     return np.concatenate([m[0] for m in meshes]), faces, np.concatenate([m[2] for m in meshes])
 
 
-def packed(
+def pack_charts(
     charts: LatentMesh, scale: NDArray, resolution: int, gutter: int = GUTTER, tight: bool = False
 ) -> LatentMesh:
-    """What ``charted`` made, packed into the unit square for a texture of ``resolution`` texels, ``gutter`` of them
+    """What ``make_charts`` made, packed into the unit square for a texture of ``resolution`` texels, ``gutter`` of them
     empty between charts. ``scale`` (F,): how long and wide each face is to be relative to the others; the same for all
     faces of a chart. Charts are turned, and may be mirrored. ``tight`` searches all places for each chart: up to a
     quarter more texels per area, for one or two seconds."""
@@ -131,10 +131,10 @@ def packed(
     guess = texels = resolution * FILLED**0.5
     for _ in range(TRIES):
         # the packer keeps lengths and makes the texture as large as it has to, which is then scaled
-        atlas = _placed(scaled, _pack_options(resolution, gutter, texels))
+        atlas = _pack(scaled, _pack_options(resolution, gutter, texels))
         # with more charts than a small texture has room for, gutters have to yield, too
         texels = max(texels * resolution / (atlas.width * atlas.height) ** 0.5, SMALLEST * guess)
-    atlas = _placed(scaled, _pack_options(resolution, gutter, texels, tight))
+    atlas = _pack(scaled, _pack_options(resolution, gutter, texels, tight))
     vertex, faces, uvs = atlas[0]
     return replace(
         charts,
@@ -144,7 +144,7 @@ def packed(
     )
 
 
-def _placed(charts: LatentMesh, options: xatlas.PackOptions) -> xatlas.Atlas:
+def _pack(charts: LatentMesh, options: xatlas.PackOptions) -> xatlas.Atlas:
     import xatlas
 
     atlas = xatlas.Atlas()

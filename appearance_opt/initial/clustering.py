@@ -20,7 +20,7 @@ PULL = 1e-2
 """How strongly vertices are drawn to the mean of their cell where quadrics are nearly flat."""
 
 
-def clustered(
+def cluster(
     positions: NDArray, faces: NDArray, vertices: int
 ) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.int64]]:
     """About ``vertices`` vertices at the most for a mesh of more; coarser parts stay as they are.

@@ -60,7 +60,7 @@ def _loss_of_half(mesh: LatentMesh, maps: Mapping[str, NDArray | float], sampler
     topology = LatentTopology(mesh, tangents="normal_x" in maps)
     scene = topology.scene()
     surface = topology.surface(mi.Float(np.ascontiguousarray(mesh.positions, np.float32).ravel()))
-    half = {n: halved(np.asarray(v)) if np.ndim(v) and n in CHANNELS else v for n, v in maps.items()}
+    half = {n: halve(np.asarray(v)) if np.ndim(v) and n in CHANNELS else v for n, v in maps.items()}
     both = [maps_of(m) for m in (maps, half)]
     grid, out = Grid(BATCH, RESOLUTION), np.zeros(len(mesh.faces))
     pixel = np.array((grid.view * grid.rows + grid.row) * grid.rows + grid.column)
@@ -81,7 +81,7 @@ def _image(scene, surface, maps: MaterialMaps, records: mi.Float, grid: Grid) ->
     return np.array(image).reshape(grid.views, grid.resolution, grid.resolution, 4)
 
 
-def halved(image: NDArray[np.float32]) -> NDArray[np.float32]:
+def halve(image: NDArray[np.float32]) -> NDArray[np.float32]:
     """(H, W) with even sides: averaged over 2 x 2 texels and read again bilinearly."""
     h, w = image.shape
     half = image.reshape(h // 2, 2, w // 2, 2).mean(axis=(1, 3))

@@ -32,7 +32,7 @@ class Separated:
     behind: NDArray[np.bool_]
 
 
-def separated(positions: NDArray, faces: NDArray, single: NDArray[np.bool_] | None) -> Separated:
+def separate(positions: NDArray, faces: NDArray, single: NDArray[np.bool_] | None) -> Separated:
     """A welded mesh with a vertex more wherever faces that are seen from one side only (``single`` (F,), None for none)
     meet others that look the opposite way, without an edge that leads from the ones to the others."""
     one_way, nothing = culled(positions, faces, single), np.zeros(len(faces), bool)

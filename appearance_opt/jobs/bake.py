@@ -169,7 +169,7 @@ class BakeJob:
         interrupts: Interrupts,
     ) -> None:
         from appearance_opt.baking import check
-        from appearance_opt.baking.target_mesh import prepare, unwrapped
+        from appearance_opt.baking.target_mesh import prepare, unwrap_asset
         from appearance_opt.reference.mesh import MeshReference
         from appearance_opt.views import views_around
 
@@ -182,7 +182,7 @@ class BakeJob:
             high, self.high = self._align(high_parts, low)
         check.check_place(high, low)
         if options.unwrap:
-            low = unwrapped(low, options.texture_size)
+            low = unwrap_asset(low, options.texture_size)
         check.check_uvs(low, name)
         backend.select(options.device)
         self.low: Low = prepare(low)

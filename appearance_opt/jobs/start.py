@@ -11,8 +11,8 @@ import numpy as np
 
 from appearance_opt.asset.sides import culled
 from appearance_opt.errors import InputError
-from appearance_opt.initial.atlas import charted, packed, unwrap
-from appearance_opt.initial.clustering import clustered
+from appearance_opt.initial.atlas import make_charts, pack_charts, unwrap
+from appearance_opt.initial.clustering import cluster
 from appearance_opt.initial.decimate import decimate_with_source
 from appearance_opt.initial.density import chart_scales
 from appearance_opt.initial.reallocate import StartError, weights
@@ -185,7 +185,7 @@ class _Decimated:
         self.coarse = is_coarse(len(merged.faces), len(merged.positions), clusters, options.budget)
         if self.coarse:
             tell("clustering vertices")
-            self.positions, self.faces, source = clustered(merged.positions, merged.faces, clusters)
+            self.positions, self.faces, source = cluster(merged.positions, merged.faces, clusters)
             self.single = reference.single[source]
             scene = upload.scene_of(self.positions, self.faces, culled(self.positions, self.faces, self.single))
         count = len(self.faces)
@@ -210,7 +210,7 @@ class _Decimated:
         if not len(faces):
             raise InputError("nothing is left of this mesh at that budget; ask for more triangles")
         self.tell(f"unwrapping {len(faces):,} triangles")
-        return self._pack_and_bake(charted(positions, faces, single[source]), np.ones(len(faces)), False)
+        return self._pack_and_bake(make_charts(positions, faces, single[source]), np.ones(len(faces)), False)
 
     def move_triangles(self, start: Start, judge: StartError, rounds: int) -> tuple[Start, float]:
         """The best of a start and those with triangles moved to where its image error is, and its error."""
@@ -226,7 +226,8 @@ class _Decimated:
         return best, error
 
     def spread_texels(self, start: Start, tight: bool) -> Start:
-        """The same triangles, with texels moved to where they are seen to be missing. ``tight``: see ``packed``."""
+        """The same triangles, with texels moved to where they are seen to be missing.
+        ``tight``: see ``pack_charts``."""
         assert start.charts is not None
         scale = np.ones(len(start.mesh.faces))
         # displaced vertices read the rim of a chart on both of its sides, which asks for the same texels everywhere
@@ -237,7 +238,7 @@ class _Decimated:
     def _pack_and_bake(self, charts: LatentMesh, scale: NDArray, tight: bool) -> Start:
         options = self.options
         self.tell("packing the atlas and baking its maps")
-        mesh = packed(charts, scale, options.texture_size, gutter(len(charts.faces), options), tight)
+        mesh = pack_charts(charts, scale, options.texture_size, gutter(len(charts.faces), options), tight)
         return replace(transfer_appearance(self.reference, mesh, options), charts=charts)
 
 

@@ -59,7 +59,7 @@ class LatentTopology:
         self.faces = upload.index_packets(mesh.faces)
         self.frame_faces = upload.index_packets(mesh.frame_faces)
         # silhouettes run along welded edges: a seam is none
-        self.welded_faces = mesh.faces if mesh.normals is None else welded(mesh.positions, mesh.faces)
+        self.welded_faces = mesh.faces if mesh.normals is None else weld_faces(mesh.positions, mesh.faces)
         self.culled = culled(mesh.positions, mesh.faces, mesh.single)
         self._culled = None if self.culled is None else mi.Bool(self.culled)
         self.edges = edge_list(self.welded_faces, self.culled)
@@ -101,7 +101,7 @@ class LatentTopology:
         return Surface(self.faces, vertices, self.frame_faces, frames, None, self.tangents, self._culled)
 
 
-def welded(positions: NDArray, faces: NDArray) -> NDArray[np.intp]:
+def weld_faces(positions: NDArray, faces: NDArray) -> NDArray[np.intp]:
     """(F, 3) the same faces through one representative vertex per place."""
     first, place = weld(positions)
     return first[place[faces]]

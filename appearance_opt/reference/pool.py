@@ -123,7 +123,7 @@ class ReferencePool:
         # on the device: NumPy takes ten times as long to halve the precision
         radiance = to_device(images)
         if not dr.all(dr.isfinite(radiance) & (radiance >= 0)):
-            checked(images, self.batch, self.resolution, what)
+            check_images(images, self.batch, self.resolution, what)
         halved = np.array(mi.Float16(at_most(radiance, LARGEST_HALF)))
         kept.update(enumerate(halved.reshape(self.batch, -1), group * self.batch))
 
@@ -138,7 +138,7 @@ def check_shape(images: NDArray[np.float32], count: int, resolution: int, what: 
         )
 
 
-def checked(images: NDArray[np.float32], count: int, resolution: int, what: str) -> NDArray[np.float32]:
+def check_images(images: NDArray[np.float32], count: int, resolution: int, what: str) -> NDArray[np.float32]:
     """The images, if there are ``count`` of them and every pixel is finite and not negative; ReferenceRenderError
     naming the first view that is not."""
     check_shape(images, count, resolution, what)

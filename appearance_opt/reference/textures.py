@@ -42,7 +42,7 @@ def material_maps(materials: list[Material]) -> MaterialMaps:
     if all(unlit):
         channels = COLORS
     # texels are packets of a power of two floats
-    bases = [_packed(m, 4 if channels is COLORS else 8) for m in materials]
+    bases = [_pack_material(m, 4 if channels is COLORS else 8) for m in materials]
     # a material's maps share one wrap mode here: horizontal wrap of its first texture
     wraps = [_WRAP[_textures(m)[0].wrap[0]] if _textures(m) else REPEAT for m in materials]
     return MaterialMaps((TexelLayer(channels, build_pyramid(bases, wraps, kind=np.float16)),), constants, some)
@@ -54,7 +54,7 @@ def emission_maps(materials: list[Material]) -> MaterialMaps | None:
         return None
     if len(materials) == 1 and materials[0].emission_texture is None:
         return MaterialMaps(constants=dict(zip(EMISSION, materials[0].emission, strict=True)))
-    bases = [_emitted(m) for m in materials]
+    bases = [_pack_emission(m) for m in materials]
     wraps = [REPEAT if m.emission_texture is None else _WRAP[m.emission_texture.wrap[0]] for m in materials]
     return MaterialMaps((TexelLayer(EMISSION, build_pyramid(bases, wraps, kind=np.float16)),))
 
@@ -73,7 +73,7 @@ def _textures(m: Material) -> list[Texture]:
     return [t for t in (m.base_color_texture, m.orm_texture, m.normal_texture) if t is not None]
 
 
-def _emitted(m: Material) -> Base:
+def _pack_emission(m: Material) -> Base:
     """Emitted linear RGB and 0."""
     size = (1, 1) if m.emission_texture is None else m.emission_texture.pixels.shape[:2]
     texture = _Rows(m.emission_texture, *size)
@@ -123,7 +123,7 @@ class _Rows:
         return replace(self._texture, pixels=self._texture.pixels[start:stop]).linear()
 
 
-def _packed(m: Material, channels: int) -> Base:
+def _pack_material(m: Material, channels: int) -> Base:
     """Texels of 8 channels: base colour, roughness, metalness, tangent-space normal in [-1, 1] (which is along the
     surface's own for materials without a normal map); of 4: base colour and roughness."""
     shapes = [t.pixels.shape[:2] for t in _textures(m)] or [(1, 1)]

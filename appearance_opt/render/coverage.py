@@ -58,7 +58,7 @@ def correction(edges: EdgeSamples, contrast: mi.ArrayXf, pixels: int, samples: i
     return out
 
 
-def corrected(image: mi.Float, missed: mi.Float) -> mi.Float:
+def add_missed(image: mi.Float, missed: mi.Float) -> mi.Float:
     """The image (pixels * 4) with what its rays missed: no radiance below 0, no coverage outside of [0, 1]."""
     is_coverage = (dr.arange(mi.UInt32, dr.width(image)) & 3) == 3
     return at_most(at_least(image + missed, 0), dr.select(is_coverage, mi.Float(1), mi.Float(dr.inf)))

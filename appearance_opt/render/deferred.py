@@ -85,7 +85,7 @@ def render_image(
         hits, _, covered = _seen(scene, drawing, grid, dx, dy, run)
         # one sample per pixel in each pass: no two threads meet
         mode = dr.ReduceMode.NoConflicts
-        image = _with_shaded(image, drawing, hits, covered, 1 / samples, width, mode, run)
+        image = _add_shaded(image, drawing, hits, covered, 1 / samples, width, mode, run)
     return image
 
 
@@ -110,7 +110,7 @@ def render_pair(
     drawing = Drawing(surface, maps, records, grid.size, grid.rows)
     hits, depth, covered = _seen(scene, drawing, grid, 0.5, 0.5, run)
     points, mode = dr.zeros(mi.Float, grid.pixels * 4), dr.ReduceMode.NoConflicts
-    points = _with_shaded(points, drawing, hits, covered, 1.0, width, mode, run)
+    points = _add_shaded(points, drawing, hits, covered, 1.0, width, mode, run)
     average, outlined = run(_without_outlines, points, hits, depth, grid.rows, grid.pixels)
     dr.eval(average, outlined)
     index = dr.compress(outlined)
@@ -118,7 +118,7 @@ def render_pair(
         at = grid.view, grid.column, grid.row, index
         fine, hit = rays.trace_pixels(scene, records, *at, samples, grid.size, run)
         mode = dr.ReduceMode.Local
-        average = _with_shaded(average, drawing, fine, dr.compress(hit), 1 / samples, samples**-0.5, mode, run)
+        average = _add_shaded(average, drawing, fine, dr.compress(hit), 1 / samples, samples**-0.5, mode, run)
     return average, points
 
 
@@ -170,7 +170,7 @@ def _without_outlines(
     return image, dr.gather(mi.Bool, outlined, pixel)
 
 
-def _with_shaded(
+def _add_shaded(
     image: mi.Float,
     drawing: Drawing,
     hits: Samples,
@@ -184,12 +184,12 @@ def _with_shaded(
     ``weight`` of its pixel."""
     if dr.width(index) == 0:
         return image
-    out = run(_added, image, drawing, hits, index, dr.opaque(mi.Float, weight), dr.opaque(mi.Float, width), mode)
+    out = run(_accumulate, image, drawing, hits, index, dr.opaque(mi.Float, weight), dr.opaque(mi.Float, width), mode)
     dr.eval(out)
     return out
 
 
-def _added(
+def _accumulate(
     image: mi.Float,
     drawing: Drawing,
     hits: Samples,

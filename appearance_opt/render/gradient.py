@@ -29,7 +29,7 @@ from appearance_opt.render.intersections import Intersections
 from appearance_opt.render.material import MaterialMaps
 from appearance_opt.render.pixels import Grid, pixel_index
 from appearance_opt.render.quality import Quality
-from appearance_opt.render.ray_lists import Weighted, Whole, concat, joined
+from appearance_opt.render.ray_lists import Weighted, Whole, concat, join_arrays
 from appearance_opt.render.rays import MISS, Samples
 from appearance_opt.render.silhouette import EdgeList, EdgeSamples
 from appearance_opt.render.surface import Surface
@@ -145,7 +145,7 @@ def _averages(
     if edges is not None and corrected is not None:
         dr.eval(image, contrast)
         missed = coverage.correction(edges, contrast, pixels, corrected, rows)
-        image = coverage.corrected(image, missed)
+        image = coverage.add_missed(image, missed)
     return image, contrast, met_contrast
 
 
@@ -239,7 +239,7 @@ def _camera_samples(
         fine, covered = rays_in(places, quality.edge_samples)
         parts.append(rays.keep(fine, dr.compress(covered)))
         weights.append(1 / quality.edge_samples)
-    return _weighted(parts, weights, grid, quality.sample_width), deferred, crossed
+    return _merge_weighted(parts, weights, grid, quality.sample_width), deferred, crossed
 
 
 def _whole_pixels(fine: Samples, covered: mi.Bool, grid: Grid, quality: Quality) -> tuple[Whole | None, mi.Bool | None]:
@@ -265,13 +265,13 @@ def _whole_pixels(fine: Samples, covered: mi.Bool, grid: Grid, quality: Quality)
     return Whole(every, pixel, dr.opaque(mi.Float, width)), others
 
 
-def _weighted(parts: list[Samples], weights: list[float], grid: Grid, width_of_one: float) -> Weighted | None:
+def _merge_weighted(parts: list[Samples], weights: list[float], grid: Grid, width_of_one: float) -> Weighted | None:
     """Lists of samples as one; each list has its weight."""
     there = [(p, w) for p, w in zip(parts, weights, strict=True) if dr.width(p.triangle)]
     if not there:
         return None
     samples = concat([p for p, _ in there])
-    weight = joined([dr.full(mi.Float, w, dr.width(p.triangle)) for p, w in there])
+    weight = join_arrays([dr.full(mi.Float, w, dr.width(p.triangle)) for p, w in there])
     pixel = pixel_index(samples, grid.rows)
     dr.eval(samples, weight, pixel)
     return Weighted(samples, pixel, weight, dr.sqrt(weight) * dr.opaque(mi.Float, width_of_one))

@@ -81,7 +81,7 @@ def render_image(
             hits, depth, light = _taken(going, hits, depth, light)
             share = run(_kept_back, drawing, coverage, hits, light, filtered)
             dr.eval(share)
-            image = _blended(image, drawing, hits, share, weight, filtered, run)
+            image = _blend(image, drawing, hits, share, weight, filtered, run)
             light = light - share
             left = dr.compress(light >= LEAST)
             if dr.width(left) == 0:
@@ -106,7 +106,7 @@ def _kept_back(drawing: Drawing, coverage: Coverage, hits: Samples, light: mi.Fl
     return coverage.at(interpolate(drawing.surface, camera, hits, drawing.size, width)) * light
 
 
-def _blended(
+def _blend(
     image: mi.Float,
     drawing: Drawing,
     hits: Samples,
@@ -119,12 +119,12 @@ def _blended(
     index = dr.compress(share > 0)
     if dr.width(index) == 0:
         return image
-    image = run(_added, image, drawing, hits, index, share, weight, width)
+    image = run(_accumulate, image, drawing, hits, index, share, weight, width)
     dr.eval(image)
     return image
 
 
-def _added(
+def _accumulate(
     image: mi.Float,
     drawing: Drawing,
     hits: Samples,

@@ -33,7 +33,7 @@ from appearance_opt.render.freezing import traced
 from appearance_opt.render.intersections import Intersections
 from appearance_opt.render.math import clamp
 from appearance_opt.render.pixels import Grid, pixel_index
-from appearance_opt.render.ray_lists import Weighted, Whole, concat, joined
+from appearance_opt.render.ray_lists import Weighted, Whole, concat, join_arrays
 from appearance_opt.render.rays import MISS, Samples
 from appearance_opt.render.silhouette import EdgeList, EdgeSamples
 from appearance_opt.render.silhouette_walk import Neighbours, choose, neighbours, walk
@@ -171,8 +171,8 @@ def _weights(
     if not parts:
         return None, deferred
     samples, pixels, weights = zip(*parts, strict=True)
-    every, pixel = concat(list(samples)), joined(list(pixels))
-    weight = joined(list(weights)) * dr.opaque(mi.Float, 1 / quality.samples)
+    every, pixel = concat(list(samples)), join_arrays(list(pixels))
+    weight = join_arrays(list(weights)) * dr.opaque(mi.Float, 1 / quality.samples)
     dr.eval(every, pixel, weight)
     return Weighted(every, pixel, weight, dr.opaque(mi.Float, quality.sample_width / fine.per_axis)), deferred
 
@@ -212,7 +212,7 @@ def find_pairs(
         pairs, edge = (
             outlines[0]
             if len(outlines) == 1
-            else (outlines[0][0].join(outlines[1][0]), joined([outlines[0][1], outlines[1][1]]))
+            else (outlines[0][0].join(outlines[1][0]), join_arrays([outlines[0][1], outlines[1][1]]))
         )
         points, d = _outline_points(edges, vertices, records, edge, pairs, fine)
         points.pixel, *blended = _blend(pairs, d, fine)
@@ -225,7 +225,7 @@ def find_pairs(
         dr.eval(met)
     if not parts:
         return None
-    pixel, receiver, weight = (joined([p[k] for p in parts]) for k in range(3))
+    pixel, receiver, weight = (join_arrays([p[k] for p in parts]) for k in range(3))
     return Pairs(points, met, receiver, pixel, concat([p[3] for p in parts]), weight)
 
 

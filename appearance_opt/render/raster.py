@@ -59,9 +59,9 @@ def visible(
     ``rays.trace_depth``). ``vertices``, ``faces``: packets of ``Surface``; ``size``, ``rows``: see ``Grid``;
     ``pixels`` of all ``views``; ``culled``: see ``Surface``. Of triangles at exactly the same depth the first is
     seen."""
-    projected = _projected(vertices, records, views, size)
+    projected = _project(vertices, records, views, size)
     dr.eval(projected)
-    image = _drawn(projected, faces, views, rows, pixels, dx, dy, culled)
+    image = _draw(projected, faces, views, rows, pixels, dx, dy, culled)
     dr.eval(image)
     nearest = dr.gather(mi.UInt64, image, (view * rows + row) * rows + column)
     triangle = mi.UInt32(nearest & 0xFFFFFFFF)
@@ -70,7 +70,7 @@ def visible(
     return samples, dr.select(triangle != MISS, depth, dr.inf)
 
 
-def _projected(vertices: mi.Float, records: mi.Float, views: int, size: mi.Float) -> mi.Float:
+def _project(vertices: mi.Float, records: mi.Float, views: int, size: mi.Float) -> mi.Float:
     """(views * V * 4) packets: position in pixels (x, y) times depth, depth, 0."""
     count = dr.width(vertices) // 8
     i = dr.arange(mi.UInt32, views * count)
@@ -88,7 +88,7 @@ def _projected(vertices: mi.Float, records: mi.Float, views: int, size: mi.Float
     return out
 
 
-def _drawn(
+def _draw(
     projected: mi.Float,
     faces: mi.UInt32,
     views: int,
@@ -157,7 +157,7 @@ def _bounds(
     p: list[mi.ArrayXf], dx: mi.Float, dy: mi.Float, last: mi.Float
 ) -> tuple[tuple[mi.Float, mi.Float], tuple[mi.Float, mi.Float], mi.Bool]:
     """((first, last column), (first, last row), is there any?) of the pixels up to number ``last`` that triangles may
-    cover: all if a vertex is behind the camera, none if all are. ``p``: packets of ``_projected``."""
+    cover: all if a vertex is behind the camera, none if all are. ``p``: packets of ``_project``."""
     behind = [q[2] <= 0 for q in p]
     crossing = behind[0] | behind[1] | behind[2]
 

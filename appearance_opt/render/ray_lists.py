@@ -35,10 +35,10 @@ def concat(parts: list[Samples]) -> Samples:
     """Lists of samples one after the other."""
     if len(parts) == 1:
         return parts[0]
-    return Samples(*(joined([getattr(p, f) for p in parts]) for f in ("view", "x", "y", "triangle")))
+    return Samples(*(join_arrays([getattr(p, f) for p in parts]) for f in ("view", "x", "y", "triangle")))
 
 
-def joined(parts: list[mi.Float]) -> mi.Float:
+def join_arrays(parts: list[mi.Float]) -> mi.Float:
     """Arrays one after the other. ``dr.concat`` would write their widths, which change every step, into the
     kernel and so compile one every step."""
     out = dr.empty(type(parts[0]), sum(dr.width(p) for p in parts))

@@ -10,7 +10,7 @@ import mitsuba as mi
 from appearance_opt.render import rays, silhouette
 from appearance_opt.render.outlines import NOTHING
 from appearance_opt.render.pixels import Grid, pixel_index
-from appearance_opt.render.ray_lists import concat, joined
+from appearance_opt.render.ray_lists import concat, join_arrays
 from appearance_opt.render.rays import MISS, Samples
 from appearance_opt.render.silhouette import EdgeList
 
@@ -38,7 +38,7 @@ class Neighbours:
 
     def join(self, other: Neighbours) -> Neighbours:
         """Both lists, one after the other."""
-        horizontal = joined([mi.UInt32(self.horizontal), mi.UInt32(other.horizontal)]) == 1
+        horizontal = join_arrays([mi.UInt32(self.horizontal), mi.UInt32(other.horizontal)]) == 1
         return Neighbours(concat([self.front, other.front]), concat([self.back, other.back]), horizontal)
 
     @property
@@ -63,7 +63,7 @@ def neighbours(hits: Samples, depth: mi.Float, fine: Grid) -> Neighbours | None:
     if not there:
         return None
     one = concat([rays.keep(hits, found[k]) for k in there])
-    horizontal = joined([dr.full(mi.UInt32, k == 0, dr.width(found[k])) for k in there]) == 1
+    horizontal = join_arrays([dr.full(mi.UInt32, k == 0, dr.width(found[k])) for k in there]) == 1
     dr.eval(one, horizontal)
     at = pixel_index(one, fine.rows)
     beyond = at + dr.select(horizontal, 1, fine.rows)

@@ -226,7 +226,7 @@ def build_pyramid(
             if after == before:
                 break
             _write(flat, after, level)
-            level = _downsampled(level)
+            level = _downsample(level)
     array = mi.Float16 if kind is np.float16 else mi.Float
     borrowed = array(flat.ravel())
     # memory of Dr.Jit's own, see ``backend.to_device``
@@ -246,11 +246,11 @@ def _write_base(flat: NDArray, base: Base, offset: int) -> NDArray[np.float32]:
         stop = min(start + step, base.height)
         rows = base.rows(start, stop)
         _write(flat, offset + start * base.width, rows)
-        after[start // 2 : (stop + 1) // 2] = _downsampled(rows)
+        after[start // 2 : (stop + 1) // 2] = _downsample(rows)
     return after
 
 
-def _downsampled(texels: NDArray[np.float32]) -> NDArray[np.float32]:
+def _downsample(texels: NDArray[np.float32]) -> NDArray[np.float32]:
     """The mean of 2 x 2 texels of (H, W, C); edges clamp. See ``downsample``."""
     height, width = texels.shape[:2]
     texels = np.pad(texels, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
