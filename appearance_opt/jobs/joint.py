@@ -90,6 +90,7 @@ def _fit_job(job: BakeJob, options: BakeOptions, progress: Progress | None, with
     from appearance_opt.initial.transfer import transfer_emission
     from appearance_opt.jobs.displaced import Exporter, bake_displacement
     from appearance_opt.jobs.fitting import clean_maps, fit_start
+    from appearance_opt.jobs.plain import flatten_maps
     from appearance_opt.jobs.start import Start, select_told
 
     light, with_kept = job.low_parts.fitted, job.low_parts.with_kept
@@ -117,6 +118,7 @@ def _fit_job(job: BakeJob, options: BakeOptions, progress: Progress | None, with
     final = clean_maps(model, start.known)
     if options.wants("emission"):
         final |= transfer_emission(job.reference, model.posed_mesh(), options.texture_size)
+    final = flatten_maps(model, final, start, job.reference, job.sampler, options)
     result = SimplifyResult(
         with_kept(exporter.base(model, final)),
         with_kept(exporter.drawn(initial, start.maps)[initial.level]),

@@ -271,6 +271,7 @@ class _Job:
         from appearance_opt.initial.transfer import transfer_emission
         from appearance_opt.jobs.displaced import Exporter
         from appearance_opt.jobs.fitting import clean_maps, fit_start
+        from appearance_opt.jobs.plain import flatten_maps
 
         o = self.options
         model, fitted, error = fit_start(
@@ -293,6 +294,7 @@ class _Job:
         begin = exporter.drawn(initial, self.start.maps)[initial.level]
         maps = clean_maps(model, self.start.known)
         maps |= transfer_emission(self.reference, model.posed_mesh(), o.texture_size)
+        maps = flatten_maps(model, maps, self.start, self.reference, self.sampler, o)
         result = exporter.base(model, maps)
         tessellated = exporter.drawn(model, maps) if o.displaced else {}
         self.watch.lap("export")

@@ -47,8 +47,8 @@ class TexelCodec:
         self._normal = [channels.index(name) for name in NORMALS] if set(NORMALS) <= set(channels) else []
         self._is_color = [c in COLORS for c in channels] + [False] * (self.packed - len(channels))
 
-    def encode(self, maps: Mapping[str, NDArray]) -> mi.Float:
-        """Stored values of maps in natural units: channel name -> (size, size)."""
+    def encode(self, maps: Mapping[str, NDArray | float]) -> mi.Float:
+        """Stored values of maps in natural units: channel name -> (size, size), or a number for all texels."""
         out = np.zeros((self.size, self.size, self.packed), np.float32)
         for k, name in enumerate(self.channels):
             low, high = BOUNDS[name]
