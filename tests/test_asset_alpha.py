@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from appearance_opt.asset import load, save
-from appearance_opt.asset.alpha import Share, counted, coverage, kind_of
+from appearance_opt.asset.alpha import Share, count_kinds, coverage, kind_of
 from appearance_opt.asset.types import Asset, Material, Mesh, Texture, Volume
 from appearance_opt.asset.validate import repair
 from appearance_opt.cli import inspect
@@ -131,7 +131,7 @@ def test_meshes_of_one_material_are_told_apart() -> None:
     got = repair(Asset((card(LEAF, name="leaf"), card(LEAF, RIGHT, name="twig"), card(LEAF, RIGHT, name="bud"))), "x")
     assert [m.material.alpha_mode for m in got.meshes] == ["mask", "opaque", "opaque"]
     assert got.meshes[1].material is got.meshes[2].material
-    assert counted(got) == {"opaque": Share(2, 4, "fitted"), "mask": Share(1, 2, "kept as it is")}
+    assert count_kinds(got) == {"opaque": Share(2, 4, "fitted"), "mask": Share(1, 2, "kept as it is")}
     assert len(got.notes) == 1
     # repeated: the period in which a face lies does not matter, and across its border lies the other half
     repeating = replace(LEAF, base_color_texture=replace(picture(), wrap=("repeat", "repeat")))

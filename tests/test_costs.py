@@ -14,7 +14,7 @@ from appearance_opt.asset import batch, load, save, usd_read, usd_write, uv_tran
 from appearance_opt.asset.gltf_accessors import Document
 from appearance_opt.asset.gltf_read import _Reader
 from appearance_opt.asset.notes import LINES, Notes
-from appearance_opt.asset.rows import count_unique_rows, ranked, unique_rows
+from appearance_opt.asset.rows import count_unique_rows, rank_rows, unique_rows
 from appearance_opt.asset.types import Asset, Material, Mesh, Texture
 from appearance_opt.asset.validate import Validation
 from appearance_opt.reference import mesh as mesh_reference
@@ -202,7 +202,7 @@ def test_rows_are_found_equal_as_numpy_finds_them() -> None:
         np.testing.assert_array_equal(kind, inverse.ravel())
         assert count_unique_rows(rows) == len(expected)
         values = rows - 1.5
-        np.testing.assert_array_equal(np.unique(values, axis=0), values[unique_rows(ranked(values))[0]])
+        np.testing.assert_array_equal(np.unique(values, axis=0), values[unique_rows(rank_rows(values))[0]])
 
 
 USD_INSTANCES = """#usda 1.0

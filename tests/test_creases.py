@@ -11,7 +11,7 @@ import trimesh
 
 from appearance_opt import bake_options, compare, simplify_options
 from appearance_opt.asset import load
-from appearance_opt.asset.creases import shaded, smooth_by_angle, split
+from appearance_opt.asset.creases import add_normals, smooth_by_angle, split
 from appearance_opt.asset.edges import Edges
 from appearance_opt.asset.normals import unit, vertex_normals
 from appearance_opt.asset.types import Asset, Mesh, srgb_to_linear
@@ -91,7 +91,7 @@ def test_a_noisy_scan_stays_smooth(deviation: float) -> None:
     ball = trimesh.creation.icosphere(4)
     noise = np.random.default_rng(0).normal(size=ball.vertices.shape)
     positions = ball.vertices + deviation * ball.edges_unique_length.mean() * noise
-    (mesh,) = shaded([Mesh(positions.astype(np.float32), ball.faces.astype(np.int32))])
+    (mesh,) = add_normals([Mesh(positions.astype(np.float32), ball.faces.astype(np.int32))])
     assert len(mesh.positions) <= 1.05 * len(ball.vertices)
 
 
@@ -102,7 +102,7 @@ def test_the_edges_of_a_noisy_cube_are_hard() -> None:
         box = box.subdivide()
     noise = np.random.default_rng(0).normal(size=box.vertices.shape)
     positions = (box.vertices + 0.05 * box.edges_unique_length.mean() * noise).astype(np.float32)
-    (mesh,) = shaded([Mesh(positions, box.faces.astype(np.int32))])
+    (mesh,) = add_normals([Mesh(positions, box.faces.astype(np.int32))])
     original = box.vertices[box.faces]
     cross = unit(np.cross(original[:, 1] - original[:, 0], original[:, 2] - original[:, 0]))
     agree = np.einsum("fkc,fc->fk", mesh.normals[mesh.faces], cross)
@@ -117,7 +117,7 @@ def test_engraved_letters_are_hard() -> None:
     n = len(outline)
     quads = [(k, k + 1, k + 1 + n, k + n) for k in range(n - 1)]
     faces = np.array([t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))])
-    (mesh,) = shaded([Mesh(p, faces.astype(np.int32))])
+    (mesh,) = add_normals([Mesh(p, faces.astype(np.int32))])
     np.testing.assert_allclose(mesh.normals[mesh.faces], np.repeat(face_normals(mesh)[:, None], 3, 1), atol=1e-6)
 
 
@@ -209,7 +209,7 @@ def test_hard_edges_do_not_tear_a_mesh() -> None:
     for _ in range(3):
         box = box.subdivide()
     whole = Mesh(box.vertices.astype(np.float32), box.faces.astype(np.int32))
-    (mesh,) = shaded([whole])
+    (mesh,) = add_normals([whole])
     assert len(mesh.positions) > len(whole.positions)
     positions, faces = decimate(mesh.positions, mesh.faces, 12)
     assert len(faces) == 12
@@ -244,11 +244,11 @@ def test_edges_join_only_faces_that_run_along_them_in_opposite_directions() -> N
     for corner, end in zip(edges.corners[0], edges.ends[0], strict=True):
         assert faces.ravel()[corner].tolist() == [end, end]
     assert not len(Edges.of(p, np.array([(0, 1, 2), (0, 1, 3)])).ends)
-    (mesh,) = shaded([Mesh(p, faces.astype(np.int32))])
+    (mesh,) = add_normals([Mesh(p, faces.astype(np.int32))])
     assert np.isfinite(mesh.normals).all()
     # a face without area divides its neighbours from itself alone
     flat = np.array([(0, 0, 0), (2, 0, 0), (1, 0, 0), (1, 1, 0), (1, -1, 0)], np.float32)
-    (mesh,) = shaded([Mesh(flat, np.array([(0, 2, 3), (2, 1, 3), (0, 1, 2), (0, 4, 1)], np.int32))])
+    (mesh,) = add_normals([Mesh(flat, np.array([(0, 2, 3), (2, 1, 3), (0, 1, 2), (0, 4, 1)], np.int32))])
     np.testing.assert_allclose(mesh.normals[mesh.faces[[0, 1, 3]]], np.tile((0, 0, 1), (3, 3, 1)), atol=1e-6)
 
 
@@ -274,14 +274,14 @@ def test_the_sides_of_a_sheet_are_smooth_each(tmp_path: Path, statement: str) ->
 def test_other_attributes_go_with_the_vertices() -> None:
     box = trimesh.creation.box()
     uvs = np.random.default_rng(0).random((8, 2)).astype(np.float32)
-    (mesh,) = shaded(
+    (mesh,) = add_normals(
         [Mesh(box.vertices.astype(np.float32), box.faces.astype(np.int32), uvs=uvs, colors=uvs[:, [0] * 3])]
     )
     np.testing.assert_array_equal(mesh.uvs[mesh.faces], uvs[box.faces])
     np.testing.assert_array_equal(mesh.positions[mesh.faces], box.vertices[box.faces].astype(np.float32))
-    assert shaded([mesh])[0] is mesh
+    assert add_normals([mesh])[0] is mesh
     broken = Mesh(mesh.positions, mesh.faces + 99)
-    assert shaded([broken])[0] is broken
+    assert add_normals([broken])[0] is broken
 
 
 @pytest.mark.parametrize("kind", ["float", "double"])

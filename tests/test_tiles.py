@@ -182,6 +182,6 @@ def test_many_tiles_are_read_smaller(tmp_path: Path, monkeypatch: pytest.MonkeyP
 def test_smaller_tiles_are_means_of_linear_values() -> None:
     pixels = np.zeros((2, 2, 4), np.uint8)
     pixels[0] = 255
-    out = udim.fitted(Texture(pixels, "srgb"), udim.Tile(1001, 1), Companions())
+    out = udim.fit_to_tile(Texture(pixels, "srgb"), udim.Tile(1001, 1), Companions())
     assert out.pixels.shape == (1, 1, 4)
     assert tuple(out.pixels[0, 0]) == (188, 188, 188, 128)  # alpha is linear

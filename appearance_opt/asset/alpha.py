@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Literal, get_args
 import numpy as np
 
 from appearance_opt.asset.normals import weld
-from appearance_opt.asset.packing import resized
+from appearance_opt.asset.packing import resize
 from appearance_opt.asset.sides import connected_parts
 from appearance_opt.asset.types import Texture
 
@@ -40,7 +40,8 @@ NAMED = 5
 
 
 def kind_of(material: Material) -> Kind:
-    """How a material is seen through, by its own words (see ``settled`` for materials that do not mean them)."""
+    """How a material is seen through, by its own words (see ``separate_opaque`` for materials that do
+    not mean them)."""
     if material.transmission > 0:
         return "transmission"
     return material.alpha_mode
@@ -75,7 +76,7 @@ def coverage(material: Material) -> tuple[float, Texture | None]:
     if alpha is None:
         return factor, Texture(kept, "linear", through.wrap)
     height, width = (max(t.pixels.shape[k] for t in (alpha, through)) for k in (0, 1))
-    values = resized(alpha.linear(), height, width) * resized(kept, height, width)
+    values = resize(alpha.linear(), height, width) * resize(kept, height, width)
     return factor, Texture(values, "linear", alpha.wrap)
 
 
@@ -89,14 +90,14 @@ class Share:
 
 
 def kept_apart(asset: Asset, by_light: bool = True) -> list[bool]:
-    """Which meshes take no part in a fit of an asset that is ``settled``: those that are seen through, and
+    """Which meshes take no part in a fit of what ``separate_opaque`` returns: those that are seen through, and
     (``by_light``) unlit ones, unless all that is opaque is unlit, for one result cannot be both."""
     clear = [seen_through(m) for m in asset.meshes]
     lit = any(not m.material.unlit for m, out in zip(asset.meshes, clear, strict=True) if not out)
     return [out or (by_light and lit and m.material.unlit) for m, out in zip(asset.meshes, clear, strict=True)]
 
 
-def counted(asset: Asset) -> dict[str, Share]:
+def count_kinds(asset: Asset) -> dict[str, Share]:
     """The share of each kind that an asset has; what is unlit is told apart."""
     apart = kept_apart(asset)
     found: dict[str, list[tuple[int, bool]]] = {kind: [] for kind in ("opaque", UNLIT, *KINDS[1:])}
@@ -107,7 +108,7 @@ def counted(asset: Asset) -> dict[str, Share]:
     return {k: Share(len(n), sum(count for count, _ in n), becomes[k]) for k, n in found.items() if n}
 
 
-def settled(asset: Asset) -> Asset:
+def separate_opaque(asset: Asset) -> Asset:
     """The asset with what is opaque all over told apart from what is not, where materials speak of transparency.
 
     Each connected part of a mesh is one or the other, by the alpha of the texels that its faces reach: one material may
@@ -136,12 +137,12 @@ def settled(asset: Asset) -> Asset:
     notes = []
     whole = [m.name for m in solid.values() if m.name not in mixed]
     if whole:
-        names = listed(whole)
+        names = list_names(whole)
         notes.append(
             f"materials that speak of transparency are opaque wherever they are used, and count as that: {names}"
         )
     if mixed:
-        told = f"{listed(mixed)} ({sum(mixed.values())} triangles)"
+        told = f"{list_names(mixed)} ({sum(mixed.values())} triangles)"
         notes.append(f"parts of transparent materials that are opaque all over are told apart from the others: {told}")
     return replace(asset, meshes=tuple(meshes), notes=(*asset.notes, *notes)) if notes else asset
 
@@ -165,7 +166,7 @@ def _only(mesh: Mesh, chosen: NDArray[np.bool_]) -> Mesh:
     return replace(mesh, faces=index.reshape(-1, 3).astype(np.int32), **kept)
 
 
-def listed(names: Iterable[str]) -> str:
+def list_names(names: Iterable[str]) -> str:
     """Names for a note, the first ``NAMED`` of them."""
     known = list(dict.fromkeys(names))
     more = f" and {len(known) - NAMED} more" if len(known) > NAMED else ""

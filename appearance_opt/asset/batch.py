@@ -111,7 +111,7 @@ def in_range(mesh: Mesh) -> bool:
     return not len(mesh.faces) or (mesh.faces.min() >= 0 and mesh.faces.max() < len(mesh.positions))
 
 
-def smoothed(meshes: Sequence[Mesh]) -> list[Mesh]:
+def fill_normals(meshes: Sequence[Mesh]) -> list[Mesh]:
     """The meshes, those without normals with angle-weighted ones (see ``summed_normals``)."""
 
     def filled(batch: Batch) -> list[Mesh]:
@@ -120,10 +120,10 @@ def smoothed(meshes: Sequence[Mesh]) -> list[Mesh]:
         index, faces, normals = split_where_cancelled(positions, faces, normals)
         return batch.reindexed(index, faces, normals=normals, tangents=None)
 
-    return replaced(meshes, [m.normals is None for m in meshes], filled)
+    return replace_chosen(meshes, [m.normals is None for m in meshes], filled)
 
 
-def replaced(meshes: Sequence[Mesh], chosen: Sequence[bool], change: Callable[[Batch], list[Mesh]]) -> list[Mesh]:
+def replace_chosen(meshes: Sequence[Mesh], chosen: Sequence[bool], change: Callable[[Batch], list[Mesh]]) -> list[Mesh]:
     """The meshes, those that are chosen as ``change`` makes them, all in one go."""
     out = list(meshes)
     numbers = [k for k, yes in enumerate(chosen) if yes]

@@ -85,7 +85,7 @@ def smooth_by_angle(
     return smooth
 
 
-def shaded(
+def add_normals(
     meshes: Sequence[Mesh], groups: Sequence[NDArray] | None = None, crease_angle: float | None = None
 ) -> list[Mesh]:
     """The meshes with normals where they have none, vertices split at hard edges. ``groups``: the

@@ -52,10 +52,10 @@ class MaterialReader:
         names = [v.get("name", "") for v in self.document.extension(VARIANTS).get("variants", [])]
         if variant is None:
             if names:
-                self.note(f"shown without a variant; there are {_quoted(names)} (--variant NAME)")
+                self.note(f"shown without a variant; there are {_quote(names)} (--variant NAME)")
             return None
         if variant not in names:
-            raise InputError(f"{self.path}: has no variant '{variant}'; there are {_quoted(names) or 'none'}")
+            raise InputError(f"{self.path}: has no variant '{variant}'; there are {_quote(names) or 'none'}")
         return names.index(variant)
 
     def of(self, primitive: dict[str, Any]) -> int | None:
@@ -260,8 +260,10 @@ class MaterialReader:
         wrap = (_WRAPS.get(sampler.get("wrapS", 0), "repeat"), _WRAPS.get(sampler.get("wrapT", 0), "repeat"))
         if pixels is None:
             return None
-        read = Texture(images.colored(pixels), space, wrap)  # type: ignore[arg-type]
-        return read if name is None or self._tile is None else udim.fitted(read, self._tile, self.document.companions)
+        read = Texture(images.to_color(pixels), space, wrap)  # type: ignore[arg-type]
+        if name is None or self._tile is None:
+            return read
+        return udim.fit_to_tile(read, self._tile, self.document.companions)
 
     def _read_tile(self, name: str) -> NDArray | None:
         companions = self.document.companions
@@ -306,7 +308,7 @@ def _coordinates(info: dict[str, Any]) -> int:
     return (_transform(info) or {}).get("texCoord", info.get("texCoord", 0))
 
 
-def _quoted(names: list[str]) -> str:
+def _quote(names: list[str]) -> str:
     return ", ".join(f"'{n}'" for n in names)
 
 

@@ -34,7 +34,7 @@ class Nodes:
         """(N, 4, 4) transforms of the nodes relative to their parents: their matrices, or translation * rotation *
         scale."""
         given = [[n.get(key, default) for n in self.nodes] for key, default in _TRANSFORM.items()]
-        out = composed(*(np.array(values, np.float64).reshape(len(self.nodes), -1) for values in given))
+        out = compose(*(np.array(values, np.float64).reshape(len(self.nodes), -1) for values in given))
         for k, node in enumerate(self.nodes):
             if "matrix" in node:
                 out[k] = np.array(node["matrix"], np.float64).reshape(4, 4).T
@@ -86,7 +86,7 @@ class Nodes:
             np.broadcast_to(given.get(key, np.array(default)), (count, len(default)))
             for key, default in _TRANSFORM.items()
         )
-        return Instances(world @ composed(*each))
+        return Instances(world @ compose(*each))
 
     def skinned(self, skin: int, attributes: dict[str, Any], read: Callable[[str], NDArray]) -> Instances:
         """Where the vertices of a skinned primitive are at rest (glTF 2.0, 3.7.3): the sum of weight * world of the
@@ -118,7 +118,7 @@ _TRANSFORM = {"translation": (0.0, 0.0, 0.0), "rotation": (0.0, 0.0, 0.0, 1.0), 
 """What a node or an instance may say of its place, and what it means to leave it out."""
 
 
-def composed(translation: NDArray, rotation: NDArray, scale: NDArray) -> NDArray[np.float64]:
+def compose(translation: NDArray, rotation: NDArray, scale: NDArray) -> NDArray[np.float64]:
     """(N, 4, 4) translation (N, 3) * rotation, unit quaternion (N, 4) as (x, y, z, w), * scale (N, 3)."""
     x, y, z, w = np.asarray(rotation, np.float64).T
     out = np.zeros((len(x), 4, 4))

@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from appearance_opt.asset import uv_transforms
-from appearance_opt.asset.batch import Batch, in_range, replaced
+from appearance_opt.asset.batch import Batch, in_range, replace_chosen
 from appearance_opt.asset.gltf_accessors import Document
 from appearance_opt.asset.gltf_draco import DRACO, Compressed
 from appearance_opt.asset.gltf_materials import READ_EXTENSIONS, VARIANTS, MaterialReader
 from appearance_opt.asset.gltf_meshopt import MESHOPT
 from appearance_opt.asset.gltf_nodes import INSTANCING, Nodes
-from appearance_opt.asset.instances import placed
+from appearance_opt.asset.instances import place_copies
 from appearance_opt.asset.normals import unit
 from appearance_opt.asset.origin import settle
 from appearance_opt.asset.types import Asset, Contents, Mesh
@@ -143,7 +143,7 @@ class _Reader:
         if "skin" in node and "JOINTS_0" in primitive["attributes"]:
             source = _Source(self.document, primitive, weights)
             place = self.nodes.skinned(node["skin"], primitive["attributes"], source.read)
-            return placed(self._read(primitive, source), place, name)
+            return place_copies(self._read(primitive, source), place, name)
         key = (node["mesh"], k, tuple(weights))
         local = self._local.get(key)
         if local is None:
@@ -156,7 +156,7 @@ class _Reader:
         if inside is not None and inside.thickness > 0 and not np.allclose(place.volumes(), 1, rtol=1e-3):
             self.note("the thickness of transmissive materials is not scaled with the nodes of their meshes")
         self.document.companions.budget.take_copies(local, place.copies, self.path)
-        return placed(local, place, name)
+        return place_copies(local, place, name)
 
     def _read(self, primitive: dict[str, Any], source: _Source) -> Mesh:
         """A primitive in its own coordinates, in double precision."""
@@ -185,7 +185,7 @@ class _Reader:
             index, faces, normals = flat_normals(batch.joined("positions"), batch.faces)
             return batch.reindexed(index, faces, normals=normals, tangents=None)
 
-        return replaced(meshes, lacking, flat)
+        return replace_chosen(meshes, lacking, flat)
 
 
 class _Source:

@@ -51,7 +51,7 @@ def read(path: Path) -> NDArray:
     return decode(read_bytes(path), str(path))
 
 
-def colored(pixels: NDArray) -> NDArray:
+def to_color(pixels: NDArray) -> NDArray:
     """Pixels of at least three channels: grey ones repeat theirs, and keep their alpha if they have one."""
     if pixels.shape[2] >= 3:
         return pixels

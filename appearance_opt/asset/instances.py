@@ -81,17 +81,17 @@ def _cofactors(m: NDArray) -> NDArray[np.float64]:
     return m[:, i, j] * m[:, k, n] - m[:, i, n] * m[:, k, j]
 
 
-def placed(mesh: Mesh, place: Instances, name: str) -> Mesh:
+def place_copies(mesh: Mesh, place: Instances, name: str) -> Mesh:
     """A mesh at all its places in the world, positions still in double precision."""
     vertices = len(mesh.positions)
     normals, tangents = mesh.normals, mesh.tangents
     if normals is not None:
-        normals = _normalized(place.normals(normals))
+        normals = _normalize(place.normals(normals))
     if tangents is not None:
         # a reflection turns cross(normal, tangent) over, but not the bitangent
         negative = place.repeated(tangents[:, 3:4] < 0)
         w = np.where(negative != place.mirrored(vertices)[:, None], -1, 1)
-        tangents = np.concatenate([_normalized(place.directions(tangents[:, :3])), w], axis=1)
+        tangents = np.concatenate([_normalize(place.directions(tangents[:, :3])), w], axis=1)
     return Mesh(
         positions=place.points(mesh.positions),  # type: ignore[arg-type]
         faces=place.faces(mesh.faces, vertices),
@@ -104,5 +104,5 @@ def placed(mesh: Mesh, place: Instances, name: str) -> Mesh:
     )
 
 
-def _normalized(v: NDArray) -> NDArray:
+def _normalize(v: NDArray) -> NDArray:
     return v / np.maximum(np.linalg.norm(v, axis=1, keepdims=True), 1e-30)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from appearance_opt.asset.materialx_nodes import Missing, NotUnderstood, Value, combined, evaluate, normal_map
+from appearance_opt.asset.materialx_nodes import Missing, NotUnderstood, Value, combine, evaluate, normal_map
 from appearance_opt.asset.packing import pack_orm, with_alpha
 from appearance_opt.asset.types import Material
 
@@ -133,7 +133,7 @@ class _SurfaceReader:
         values = [self._value(*weight, 1), self._value(*color, 3)]
         if values[0].texture is None and not values[0].factor.any():
             return Value(np.zeros(3, np.float32))
-        return self._or_default(color[0], values[1], lambda: combined(np.multiply, values, True).adapted(3))
+        return self._or_default(color[0], values[1], lambda: combine(np.multiply, values, True).adapted(3))
 
     def _value(self, name: str, default: float, width: int) -> Value:
         given = self.surface.input(name) if name else None

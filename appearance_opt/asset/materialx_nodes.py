@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 
 from appearance_opt.asset import images, uv_transforms
-from appearance_opt.asset.packing import resized
+from appearance_opt.asset.packing import resize
 from appearance_opt.asset.types import Texture
 from appearance_opt.asset.uv_transforms import Place
 
@@ -64,7 +64,7 @@ _CHANNELS = {"r": 0, "x": 0, "g": 1, "y": 1, "b": 2, "z": 2, "a": 3, "w": 3}
 _LUMA = np.array([0.2722287, 0.6740818, 0.0536895], np.float32)
 
 
-def _remapped(x: NDArray, low: NDArray, high: NDArray, new_low: NDArray, new_high: NDArray) -> NDArray:
+def _remap(x: NDArray, low: NDArray, high: NDArray, new_low: NDArray, new_high: NDArray) -> NDArray:
     return new_low + (x - low) / (high - low) * (new_high - new_low)
 
 
@@ -84,7 +84,7 @@ _ARITHMETIC: dict[str, tuple[dict[str, float], Callable[..., NDArray]]] = {
     "invert": ({"in": 0, "amount": 1}, lambda x, amount: amount - x),
     "clamp": ({"in": 0, "low": 0, "high": 1}, lambda x, low, high: np.minimum(np.maximum(x, low), high)),
     "mix": ({"fg": 0, "bg": 0, "mix": 0}, lambda fg, bg, mix: bg + (fg - bg) * mix),
-    "remap": ({"in": 0, "inlow": 0, "inhigh": 1, "outlow": 0, "outhigh": 1}, _remapped),
+    "remap": ({"in": 0, "inlow": 0, "inhigh": 1, "outlow": 0, "outhigh": 1}, _remap),
     "contrast": ({"in": 0, "amount": 1, "pivot": 0.5}, lambda x, amount, pivot: (x - pivot) * amount + pivot),
     "luminance": ({"in": 0}, _luminance),
     "saturate": ({"in": 0, "amount": 1}, lambda x, amount: _luminance(x) * (1 - amount) + x * amount),
@@ -152,7 +152,7 @@ def normal_map(given: Input, depth: int = 0) -> tuple[Value, float]:
     if node.category in ("dot", "convert", "normalize"):
         return normal_map(node.input("in") or Input(), depth + 1)
     if node.category == "UsdUVTexture":  # its scale and bias make normals of texels
-        return combined(lambda n: n * np.float32(0.5) + np.float32(0.5), [evaluate(given, 3)]), 1.0
+        return combine(lambda n: n * np.float32(0.5) + np.float32(0.5), [evaluate(given, 3)]), 1.0
     raise NotUnderstood(f"the node '{node.category}'")
 
 
@@ -164,11 +164,11 @@ def evaluate(given: Input, width: int, depth: int = 0) -> Value:
         if given.value is None or isinstance(given.value, str):
             raise Missing
         return Value(np.array(given.value, np.float32)).adapted(width)
-    value = _selected(_evaluate(given.node, depth + 1), given.node, given.output)
+    value = _select(_evaluate(given.node, depth + 1), given.node, given.output)
     return value.adapted(width)
 
 
-def _selected(value: Value, node: Node, output: str) -> Value:
+def _select(value: Value, node: Node, output: str) -> Value:
     """One of several outputs of a node."""
     name = output.removeprefix("out")
     if (
@@ -204,7 +204,7 @@ def _evaluate(node: Node, depth: int) -> Value:
         return evaluate(node.input("in") or Input((0.0,)), node.width or 1, depth)
     if category.startswith("combine"):
         parts = [get(f"in{k + 1}", 0.0, 1) for k in range(int(category[7:]))]
-        return combined(lambda *channels: np.concatenate(np.broadcast_arrays(*channels), axis=-1), parts)
+        return combine(lambda *channels: np.concatenate(np.broadcast_arrays(*channels), axis=-1), parts)
     if category.startswith("separate"):
         return get("in", 0.0, 4 if category.endswith("4") else 3)
     if category == "extract":
@@ -219,7 +219,7 @@ def _evaluate(node: Node, depth: int) -> Value:
         parts = [fixed[n] if n in fixed else _channel(value, _CHANNELS[n]) for n in names]
         if len(set(names)) == 1:
             return parts[0].adapted(len(names))
-        return combined(lambda *channels: np.concatenate(np.broadcast_arrays(*channels), axis=-1), parts)
+        return combine(lambda *channels: np.concatenate(np.broadcast_arrays(*channels), axis=-1), parts)
     if category == "switch":
         return get(f"in{int(number(node, 'which', 0.0)) + 1}")
     if category in ("geomcolor", "geompropvalue", "UsdPrimvarReader"):
@@ -230,7 +230,7 @@ def _evaluate(node: Node, depth: int) -> Value:
         raise NotUnderstood(f"the node '{category}'")
     defaults, function = _ARITHMETIC[category]
     values = [_as_given(node.input(name) or Input((default,)), node.width, depth) for name, default in defaults.items()]
-    return combined(
+    return combine(
         function, values, keeps_texture=category == "multiply" or (category == "divide" and not _textured(values[1:]))
     )
 
@@ -248,7 +248,7 @@ def _textured(values: list[Value]) -> bool:
     return any(v.texture is not None for v in values)
 
 
-def combined(function: Callable[..., NDArray], values: list[Value], keeps_texture: bool = False) -> Value:
+def combine(function: Callable[..., NDArray], values: list[Value], keeps_texture: bool = False) -> Value:
     """A function of values. ``keeps_texture``: it multiplies, so that one picture among constants stays as it is."""
     pictures = [v for v in values if v.texture is not None]
     if not pictures:
@@ -261,7 +261,7 @@ def combined(function: Callable[..., NDArray], values: list[Value], keeps_textur
     if any(not v.place.equals(pictures[0].place) for v in pictures):
         raise NotUnderstood("pictures at different places, one combined with the other")
     height, width = (max(v.texture.pixels.shape[k] for v in pictures if v.texture is not None) for k in (0, 1))
-    arrays = [v.linear() if v.texture is None else resized(v.linear(), height, width) for v in values]
+    arrays = [v.linear() if v.texture is None else resize(v.linear(), height, width) for v in values]
     with np.errstate(all="ignore"):
         pixels = np.ascontiguousarray(function(*arrays), np.float32)
     if not np.isfinite(pixels).all():
@@ -294,7 +294,7 @@ def _image(node: Node, depth: int) -> Value:
         return evaluate(default, node.width or 3, depth)
     several = node.category in ("gltf_colorimage", "UsdUVTexture")  # they have channels as outputs of their own
     width = (pixels.shape[2] if pixels.shape[2] == 4 else 3) if several else node.width or 3
-    pixels = pixels[..., :1] if width == 1 else _channels(images.colored(pixels), width)
+    pixels = pixels[..., :1] if width == 1 else _channels(images.to_color(pixels), width)
     file = node.input("file")
     given = file.space if file is not None else None
     space: ColorSpace = (given or ("srgb" if pixels.dtype == np.uint8 else "linear")) if node.colors else "linear"
@@ -318,7 +318,7 @@ def _image(node: Node, depth: int) -> Value:
         factor = scale
         if bias.any():
             value = Value(scale, texture, place)
-            return combined(lambda x, b: x + b, [value, Value(bias)])
+            return combine(lambda x, b: x + b, [value, Value(bias)])
     return Value(factor, texture, place)
 
 

@@ -215,13 +215,13 @@ class _Statements:
                 channel = alpha if has_alpha else 0
             pixels = pixels[..., min(channel, pixels.shape[2] - 1)][..., None]
         else:
-            pixels = images.colored(pixels)
+            pixels = images.to_color(pixels)
         if pixels.dtype.kind == "f":  # EXR and HDR files are linear
             space = "linear"
         texture = Texture(np.ascontiguousarray(pixels), space, (given.wrap, given.wrap))
         if self.tile is None or not udim.is_tiled(given.file):
             return texture
-        return udim.fitted(texture, self.tile, self.companions)
+        return udim.fit_to_tile(texture, self.tile, self.companions)
 
     def _pixels(self, file: str) -> NDArray | None:
         """None if the file is missing and that is to be ignored, or if it is one in tiles and none is asked for."""

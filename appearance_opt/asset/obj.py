@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from appearance_opt.asset.creases import shaded
+from appearance_opt.asset.creases import add_normals
 from appearance_opt.asset.mtl import MaterialReader
 from appearance_opt.asset.origin import settle
 from appearance_opt.asset.paths import read_text
@@ -139,7 +139,7 @@ class _Parser:
             # once a file says anything of smoothing, faces without a group are flat, as the format says;
             # of one that does not, as scans are, nothing is known
             groups = [np.array(g)[face] for g, (_, face) in zip(self.groups.values(), read, strict=True)]
-            meshes = shaded(meshes, groups if self.says_groups else None, crease_angle)
+            meshes = add_normals(meshes, groups if self.says_groups else None, crease_angle)
         meshes = self.materials.apply_uv_transforms(meshes, keep_layout)
         return Asset(tuple(meshes), self.path.stem, self.companions.notes.lines(), origin=origin)
 

@@ -13,7 +13,7 @@ EMISSION = ("emission_red", "emission_green", "emission_blue")
 """Names of the channels of emission among those of baked maps."""
 
 
-def resized(pixels: NDArray[np.float32], height: int, width: int) -> NDArray[np.float32]:
+def resize(pixels: NDArray[np.float32], height: int, width: int) -> NDArray[np.float32]:
     """Bilinear enlargement of (H, W, C) pixels, texel centres at (i + 0.5) / size."""
     if pixels.shape[:2] == (height, width):
         return pixels
@@ -42,7 +42,7 @@ def pack_orm(roughness: Texture | None, metalness: Texture | None) -> Texture:
         planes = [None if t is None else t.pixels[..., 0] for t in (roughness, metalness)]
     else:
         out = np.ones((height, width, 3), np.float32)
-        planes = [None if t is None else resized(t.linear(), height, width)[..., 0] for t in (roughness, metalness)]
+        planes = [None if t is None else resize(t.linear(), height, width)[..., 0] for t in (roughness, metalness)]
     for channel, plane in zip((1, 2), planes, strict=True):
         if plane is not None:
             out[..., channel] = plane
@@ -51,20 +51,20 @@ def pack_orm(roughness: Texture | None, metalness: Texture | None) -> Texture:
 
 def with_occlusion(orm: Texture | None, occlusion: Texture) -> Texture:
     """A texture of roughness and metalness (1 without one) with the first channel of another as its occlusion."""
-    return _replaced(_white(occlusion) if orm is None else orm, 0, occlusion)
+    return _replace(_white(occlusion) if orm is None else orm, 0, occlusion)
 
 
 def with_alpha(color: Texture | None, alpha: Texture) -> Texture:
     """A base colour (white without one) with the first channel of another texture as its alpha."""
     color = replace(_white(alpha), color_space="srgb") if color is None else color
-    return _replaced(color, 3, alpha)
+    return _replace(color, 3, alpha)
 
 
 def _white(like: Texture) -> Texture:
     return Texture(np.full((*like.pixels.shape[:2], 3), 255, np.uint8), "linear", like.wrap)
 
 
-def _replaced(texture: Texture, channel: int, source: Texture) -> Texture:
+def _replace(texture: Texture, channel: int, source: Texture) -> Texture:
     """A texture whose ``channel`` (one more than there are, too) is the first one of another. The smaller of the two is
     brought to the size of the larger; those of one size and depth keep their texels."""
     height, width = (max(t.pixels.shape[k] for t in (texture, source)) for k in (0, 1))
@@ -72,7 +72,7 @@ def _replaced(texture: Texture, channel: int, source: Texture) -> Texture:
     if stored and texture.pixels.shape[:2] == source.pixels.shape[:2]:
         pixels, plane, space = texture.pixels, source.pixels[..., :1], texture.color_space
     else:
-        pixels, plane = (resized(t.linear(), height, width) for t in (texture, source))
+        pixels, plane = (resize(t.linear(), height, width) for t in (texture, source))
         plane, space = plane[..., :1], "linear"
     pixels = np.concatenate([pixels[..., :channel], plane, pixels[..., channel + 1 :]], axis=2)
     return Texture(np.ascontiguousarray(pixels), space, texture.wrap)

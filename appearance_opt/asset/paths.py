@@ -66,12 +66,12 @@ def differing_in_case(path: Path) -> Path | None:
     found = [Path(path.anchor)]
     for part in path.parts[1:]:
         within = [p / part for p in found if (p / part).exists()]
-        found = within or [q for p in found if p.is_dir() for q in _listed(p) if q.name.lower() == part.lower()]
+        found = within or [q for p in found if p.is_dir() for q in _list_files(p) if q.name.lower() == part.lower()]
     files = [p for p in found if p.is_file()]
     return files[0] if len(files) == 1 else None
 
 
-def _listed(folder: Path) -> list[Path]:
+def _list_files(folder: Path) -> list[Path]:
     try:
         return list(folder.iterdir())
     except OSError:  # it may be entered, but not listed

@@ -13,12 +13,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from appearance_opt.asset import images
-from appearance_opt.asset.creases import shaded
+from appearance_opt.asset.creases import add_normals
 from appearance_opt.asset.normals import unit
 from appearance_opt.asset.origin import settle
 from appearance_opt.asset.paths import read_bytes
 from appearance_opt.asset.polygons import Polygons, triangulate
-from appearance_opt.asset.rows import ranked, unique_rows
+from appearance_opt.asset.rows import rank_rows, unique_rows
 from appearance_opt.asset.types import Asset, Material, Mesh, Texture, srgb_to_linear
 from appearance_opt.errors import InputError
 
@@ -44,7 +44,7 @@ def load_ply(path: Path, companions: Companions, keep_layout: bool = False, crea
 class _Reader:
     def __init__(self, path: Path, companions: Companions) -> None:
         self.path, self.companions, self.note = path, companions, companions.note
-        self.data = _parsed(path)
+        self.data = _parse(path)
         names = [e.name for e in self.data.elements]
         if "tristrips" in names:
             raise InputError(f"{path}: triangle strips are not supported; save it with faces")
@@ -70,7 +70,7 @@ class _Reader:
             self.note("its colours are not drawn where it has a texture")
         settled, origin = settle(meshes, self.note)
         if not keep_layout:
-            settled = shaded(settled, crease_angle=crease_angle)
+            settled = add_normals(settled, crease_angle=crease_angle)
         return Asset(tuple(settled), self.path.stem, self.companions.notes.lines(), origin=origin)
 
     def _triangles(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -103,8 +103,8 @@ class _Reader:
         normals = self._given(self.vertex, (("nx", "ny", "nz"),))
         if normals is not None and normals.any():
             values["normals"] = unit(normals).astype(np.float32)
-        uvs, colors = self._given(self.vertex, _UVS), _decoded(self.vertex)
-        wedge, painted = self._wedge_uvs(), _decoded(self.face) if colors is None else None
+        uvs, colors = self._given(self.vertex, _UVS), _decode(self.vertex)
+        wedge, painted = self._wedge_uvs(), _decode(self.face) if colors is None else None
         if uvs is not None and wedge is None:
             values["uvs"] = uvs.astype(np.float32)
         if colors is not None:
@@ -156,7 +156,7 @@ class _Reader:
         pixels = self.companions.read(lambda: self.companions.picture(self.companions.find(name, self.path)))
         if pixels is None:
             return None
-        pixels = np.ascontiguousarray(images.colored(pixels)[..., :3])
+        pixels = np.ascontiguousarray(images.to_color(pixels)[..., :3])
         return Texture(pixels, "linear" if pixels.dtype.kind == "f" else "srgb")
 
     def _texture_numbers(self, count: int) -> NDArray[np.int64]:
@@ -168,11 +168,11 @@ class _Reader:
 
 def _distinct(values: NDArray) -> tuple[NDArray, NDArray]:
     """(different rows, which of them each row is)."""
-    first, number = unique_rows(ranked(values))
+    first, number = unique_rows(rank_rows(values))
     return values[first], number
 
 
-def _decoded(element: Any) -> NDArray[np.float32] | None:
+def _decode(element: Any) -> NDArray[np.float32] | None:
     """(N, 3) linear colours of vertices or faces, which files hold sRGB encoded; None without any."""
     there = element.dtype.names or ()
     names = next((c for c in _COLORS if all(n in there for n in c)), None)
@@ -197,7 +197,7 @@ def _flat(lists: NDArray) -> tuple[NDArray[np.int64], NDArray]:
     return counts, np.concatenate(list(lists)) if len(lists) else np.empty(0, np.int64)
 
 
-def _parsed(path: Path) -> Any:
+def _parse(path: Path) -> Any:
     import plyfile
 
     head = read_bytes(path)[:_HEADER].partition(b"end_header")[0].decode("latin-1")

@@ -53,8 +53,8 @@ def _taps(at: NDArray, size: int, mode: Wrap) -> list[tuple[NDArray[np.int64], N
     corner = np.floor(at)
     fraction = at - corner
     first = corner.astype(np.int64)
-    taps = [(_wrapped(first, size, mode), 1 - fraction)]
-    return taps + [(_wrapped(first + 1, size, mode), fraction)] if fraction.any() else taps
+    taps = [(_wrap(first, size, mode), 1 - fraction)]
+    return taps + [(_wrap(first + 1, size, mode), fraction)] if fraction.any() else taps
 
 
 def bilinear(texture: Texture, uv: NDArray) -> NDArray[np.float64]:
@@ -68,13 +68,13 @@ def bilinear(texture: Texture, uv: NDArray) -> NDArray[np.float64]:
     for dx in (0, 1):
         for dy in (0, 1):
             weight = np.abs(1 - dx - fraction[:, 0]) * np.abs(1 - dy - fraction[:, 1])
-            column = _wrapped(corner[:, 0].astype(np.int64) + dx, width, texture.wrap[0])
-            row = _wrapped(corner[:, 1].astype(np.int64) + dy, height, texture.wrap[1])
+            column = _wrap(corner[:, 0].astype(np.int64) + dx, width, texture.wrap[0])
+            row = _wrap(corner[:, 1].astype(np.int64) + dy, height, texture.wrap[1])
             out += weight[:, None] * texture.pixels[row, column]
     return out
 
 
-def _wrapped(index: NDArray[np.int64], size: int, mode: Wrap) -> NDArray[np.int64]:
+def _wrap(index: NDArray[np.int64], size: int, mode: Wrap) -> NDArray[np.int64]:
     if mode == "clamp":
         return np.clip(index, 0, size - 1)
     if mode == "repeat":

@@ -28,7 +28,7 @@ def count_unique_rows(rows: NDArray) -> int:
     return int(_begins(np.sort(_keys(rows))).sum())
 
 
-def ranked(values: NDArray) -> NDArray[np.intp]:
+def rank_rows(values: NDArray) -> NDArray[np.intp]:
     """(N, K) the rank of each number of (N, K) among the different ones of its column: integers for ``unique_rows``
     in the order of the numbers."""
     return np.stack([np.unique(column, return_inverse=True)[1].ravel() for column in values.T], axis=1)

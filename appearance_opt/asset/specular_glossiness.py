@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from appearance_opt.asset.packing import resized
+from appearance_opt.asset.packing import resize
 from appearance_opt.asset.types import Texture, linear_to_srgb
 
 DIELECTRIC = 0.04
@@ -74,7 +74,7 @@ def textures(material: Specular) -> tuple[Texture, Texture]:
     orm = np.full((height, width, 3), 255, np.uint8)
     # textures of different sizes are brought to the larger one, each as a whole
     whole = [
-        t if t is None or t.pixels.shape[:2] == (height, width) else _enlarged(t, height, width)
+        t if t is None or t.pixels.shape[:2] == (height, width) else _enlarge(t, height, width)
         for t in (material.diffuse_texture, material.specular_texture)
     ]
     for row in range(0, height, ROWS):
@@ -101,5 +101,5 @@ def _rgba(texture: Texture) -> NDArray[np.float32]:
     return pixels if pixels.shape[2] == 4 else np.concatenate([pixels, np.ones_like(pixels[..., :1])], axis=2)
 
 
-def _enlarged(texture: Texture, height: int, width: int) -> Texture:
-    return Texture(resized(texture.linear(), height, width), "linear", texture.wrap)
+def _enlarge(texture: Texture, height: int, width: int) -> Texture:
+    return Texture(resize(texture.linear(), height, width), "linear", texture.wrap)

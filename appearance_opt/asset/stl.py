@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from appearance_opt.asset.creases import shaded
+from appearance_opt.asset.creases import add_normals
 from appearance_opt.asset.normals import weld
 from appearance_opt.asset.origin import settle
 from appearance_opt.asset.paths import read_bytes
@@ -55,7 +55,7 @@ def load_stl(path: Path, keep_layout: bool = False, crease_angle: float | None =
     mesh = Mesh(positions, faces.astype(np.int32), colors=vertex_colors, material=material, name=path.stem)  # type: ignore[arg-type]
     meshes, origin = settle([mesh], notes.append)
     if not keep_layout:
-        meshes = shaded(meshes, crease_angle=crease_angle)
+        meshes = add_normals(meshes, crease_angle=crease_angle)
     return Asset(tuple(meshes), path.stem, tuple(notes), origin=origin)
 
 

@@ -91,7 +91,7 @@ def _any_tile(name: str, owner: Path) -> bool:
     return any(re.fullmatch(pattern, n) for n in names)
 
 
-def fitted(texture: Texture, tile: Tile, companions: Companions) -> Texture:
+def fit_to_tile(texture: Texture, tile: Tile, companions: Companions) -> Texture:
     """A tile's texture at a half, a third ... of its size, as means of linear values, so that it has no more texels
     than it may; it ends at its edge. ``note`` is told."""
     texture = replace(texture, wrap=("clamp", "clamp"))

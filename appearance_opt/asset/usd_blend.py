@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 
-def blended(prim: Any, points: NDArray) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+def blend_shapes(prim: Any, points: NDArray) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
     """((V, 3) points, (V, 3) what is added to the normals of these points) of a mesh with blend shapes;
     None without any. Weights are those that the animation of its skeleton has apart from its time samples
     (UsdSkelAnimation, "Blend Shapes"), which are animation, and zero otherwise."""

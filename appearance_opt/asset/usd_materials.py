@@ -212,7 +212,7 @@ class MaterialReader:
     def _fitted(self, texture: Texture, text: str) -> Texture:
         if self._tile is None or not udim.is_tiled(text):
             return texture
-        return udim.fitted(texture, self._tile, self.companions)
+        return udim.fit_to_tile(texture, self._tile, self.companions)
 
     def _read(self, material: Any) -> Material:
         name = str(material.GetPrim().GetName())
@@ -365,7 +365,7 @@ class MaterialReader:
             space = "srgb"
         elif pixels.dtype != np.uint8 or pixels.shape[2] < 3:
             space = "linear"  # "auto" takes 8-bit colours alone for sRGB
-        pixels = images.colored(pixels)
+        pixels = images.to_color(pixels)
         if channel in _CHANNEL:
             if channel == "a":  # linear in any picture, and 1 in those without
                 space = "linear"

@@ -12,18 +12,18 @@ import numpy as np
 
 from appearance_opt.asset import usd_shapes, uv_transforms
 from appearance_opt.asset.alpha import OPAQUE
-from appearance_opt.asset.batch import smoothed
+from appearance_opt.asset.batch import fill_normals
 from appearance_opt.asset.companions import Companions
-from appearance_opt.asset.instances import Instances, placed
+from appearance_opt.asset.instances import Instances, place_copies
 from appearance_opt.asset.normals import accumulate, unit
 from appearance_opt.asset.notes import Notes
 from appearance_opt.asset.origin import settle
 from appearance_opt.asset.paths import check_inside, common_folder, read_bytes
 from appearance_opt.asset.polygons import Polygons, triangulate
-from appearance_opt.asset.rows import ranked, unique_rows
+from appearance_opt.asset.rows import rank_rows, unique_rows
 from appearance_opt.asset.subdivide import Sharpness, catmull_clark
 from appearance_opt.asset.types import Asset, Contents, Mesh
-from appearance_opt.asset.usd_blend import blended
+from appearance_opt.asset.usd_blend import blend_shapes
 from appearance_opt.asset.usd_guard import check_usd
 from appearance_opt.asset.usd_materials import MaterialReader
 from appearance_opt.errors import InputError
@@ -298,13 +298,13 @@ class _Reader:
                 local = np.array(self._to_world(part) * back)
                 place = self._place(local @ each[number == k] @ world)
                 # normals of its own for each, so that instances which touch are not smoothed across
-                meshes += [self._put(one, place) for one in smoothed(self._parts(part))]
+                meshes += [self._put(one, place) for one in fill_normals(self._parts(part))]
         return meshes
 
     def _put(self, mesh: Mesh, place: Instances) -> Mesh:
         """A mesh at all its places."""
         self.companions.budget.take_copies(mesh, place.copies, self.path)
-        return placed(mesh, place, mesh.name)
+        return place_copies(mesh, place, mesh.name)
 
     def _place(self, to_world: Any) -> Instances:
         """Where the copies of a mesh are, in metres, Y up; ``to_world``: (P, 4, 4) for rows, as USD has them."""
@@ -368,7 +368,7 @@ class _Reader:
             self.note(f"'{prim.GetPath()}': faces with fewer than three corners ignored")
         polygons = Polygons(counts, indices)
         face_ids = np.arange(len(counts))
-        shape = blended(prim, points)
+        shape = blend_shapes(prim, points)
         if shape is not None:
             points = shape[0]
             told = "blend shapes: the shape of their default weights is kept, others are dropped"
@@ -512,7 +512,7 @@ def _facets(points: NDArray, polygons: Polygons, flipped: bool) -> tuple[NDArray
     total = np.zeros((len(polygons.counts), 3))
     accumulate(total, face, np.cross(corner - first, corner[polygons.next()] - first))
     normals = unit(-total if flipped else total).astype(np.float32)
-    of_kind, index = unique_rows(ranked(normals))
+    of_kind, index = unique_rows(rank_rows(normals))
     return normals[of_kind].astype(np.float64), Polygons(polygons.counts, index[face])
 
 
@@ -532,7 +532,7 @@ def _expand(value: Any, how: str, polygons: Polygons, width: int) -> tuple[NDArr
         return v, Polygons(polygons.counts, np.repeat(np.arange(len(v)), polygons.counts))
     if how == "faceVarying" and len(v) == corners:
         # corners of one point with one value are one vertex: seams are where values differ
-        used, index = unique_rows(np.concatenate([polygons.indices[:, None], ranked(v)], axis=1))
+        used, index = unique_rows(np.concatenate([polygons.indices[:, None], rank_rows(v)], axis=1))
         return v[used], Polygons(polygons.counts, index)
     return None
 

@@ -69,7 +69,7 @@ def under_one_set(
         turns = None
         if name == "normal_texture" and transforms[name].coordinates != transforms[leading].coordinates:
             turns = _turns(positions, corners[name], corners[leading])
-        new[name] = _drawn(texture, face, to, turns)
+        new[name] = _redraw(texture, face, to, turns)
     uvs = [((transforms[leading].of(np.asarray(m.uvs)) * size - low) / extent).astype(np.float32) for m in meshes]
     normal = transforms.get("normal_texture")
     turned = normal is not None and normal.coordinates != transforms[leading].coordinates
@@ -243,7 +243,7 @@ def _dot(a: NDArray, b: NDArray) -> NDArray:
     return np.einsum("fi,fi->f", a, b)
 
 
-def _drawn(texture: Texture, face: NDArray, to: NDArray, turns: NDArray | None) -> Texture:
+def _redraw(texture: Texture, face: NDArray, to: NDArray, turns: NDArray | None) -> Texture:
     """The texture in the layout of ``face``; ``to``: the map (F, 2, 3) of each face from texels to where it reads."""
     rows, columns = face.shape
     out = np.empty((rows, columns, texture.pixels.shape[2]), texture.pixels.dtype)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from appearance_opt.asset.alpha import settled
+from appearance_opt.asset.alpha import separate_opaque
 from appearance_opt.asset.batch import WIDTHS, Batch
 from appearance_opt.asset.normals import apart, unit, vertex_normals, weld
 from appearance_opt.asset.notes import Notes
@@ -57,7 +57,7 @@ class Validation:
     """Faces whose winding disagrees with the normals of their vertices."""
 
 
-def inspected(asset: Asset, path: str) -> tuple[Validation, Asset]:
+def repair_and_count(asset: Asset, path: str) -> tuple[Validation, Asset]:
     """(counts, the asset after ``repair``): of what that mends as it is in the file, of all else as it is left."""
     mended = repair(asset, path)
     found, left = validate(asset), mended.meshes
@@ -135,7 +135,7 @@ def repair(asset: Asset, source: str) -> Asset:
 
     Dropped: degenerate faces, unreferenced vertices, empty meshes. Recomputed: normals that are not
     finite or zero. Clamped: texture coordinates, colours and factors beyond their range. Opaque: what only speaks
-    of transparency (``alpha.settled``). Raises InputError
+    of transparency (``alpha.separate_opaque``). Raises InputError
     for positions, texture coordinates or factors that are not finite, attributes that do not fit the
     positions, indices out of range, and when no face is left.
     """
@@ -151,7 +151,7 @@ def repair(asset: Asset, source: str) -> Asset:
     mended = {key: repair_material(m, source, notes) for key, m in materials.items()}
     new = [mended[id(m.material)] for m in meshes]
     meshes = [m if m.material is n else replace(m, material=n) for m, n in zip(meshes, new, strict=True)]
-    return settled(replace(asset, meshes=tuple(meshes), notes=asset.notes + notes.lines()))
+    return separate_opaque(replace(asset, meshes=tuple(meshes), notes=asset.notes + notes.lines()))
 
 
 def _suspects(meshes: Sequence[Mesh]) -> NDArray[np.bool_]:
@@ -223,7 +223,7 @@ def _repair(mesh: Mesh, source: str, notes: Notes) -> Mesh:
         used = np.unique(mesh.faces)
     if len(used) < len(mesh.positions):
         notes(f"mesh '{mesh.name}': {len(mesh.positions) - len(used)} unreferenced vertices dropped")
-        mesh = _compacted(mesh, used)
+        mesh = _compact(mesh, used)
     return _repair_normals(_repair_ranges(mesh, notes), notes)
 
 
@@ -288,7 +288,7 @@ def _repair_normals(mesh: Mesh, notes: Notes) -> Mesh:
     return mesh
 
 
-def _compacted(mesh: Mesh, used: NDArray) -> Mesh:
+def _compact(mesh: Mesh, used: NDArray) -> Mesh:
     new = np.full(len(mesh.positions), -1, np.int32)
     new[used] = np.arange(len(used), dtype=np.int32)
     attributes = ("positions", "normals", "uvs", "tangents", "colors")

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from appearance_opt.asset import load, sides
-from appearance_opt.asset.alpha import FITTED, KEPT, UNLIT, Share, counted, kept_apart, kind_of, settled
+from appearance_opt.asset.alpha import FITTED, KEPT, UNLIT, Share, count_kinds, kept_apart, kind_of, separate_opaque
 from appearance_opt.asset.types import Contents, Texture
-from appearance_opt.asset.validate import Validation, inspected
+from appearance_opt.asset.validate import Validation, repair_and_count
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -143,9 +143,9 @@ def inspect(
         crease_angle=crease_angle,
         mend=False,
     )
-    counts, asset = inspected(given, str(source))
+    counts, asset = repair_and_count(given, str(source))
     low, high = asset.bounds()
-    parts = settled(asset)
+    parts = separate_opaque(asset)
     fitted = (m for m, out in zip(parts.meshes, kept_apart(parts), strict=True) if not out)
     one_way, backs = sides.counted(tuple(fitted))
     textures = _textures({id(m.material): m.material for m in asset.meshes}.values())
@@ -166,7 +166,7 @@ def inspect(
         textures=len(textures),
         texture_bytes=sum(t.nbytes for t in textures),
         contents=asset.contents,
-        alpha=counted(parts),
+        alpha=count_kinds(parts),
         notes=parts.notes,
     )
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from appearance_opt.asset.alpha import kept_apart, listed, seen_through, settled
+from appearance_opt.asset.alpha import kept_apart, list_names, seen_through, separate_opaque
 from appearance_opt.errors import InputError
 
 if TYPE_CHECKING:
@@ -42,7 +42,7 @@ class Parts:
         for what, seen in (("transparent", True), ("unlit", False)):
             meshes = [m for m in self.kept if seen_through(m) == seen]
             if meshes:
-                names, count = listed(m.name for m in meshes), sum(len(m.faces) for m in meshes)
+                names, count = list_names(m.name for m in meshes), sum(len(m.faces) for m in meshes)
                 out.append(f"{what} parts {becomes}: {len(meshes)} ({names}) of {count} triangles")
         return out
 
@@ -50,13 +50,14 @@ class Parts:
 def split(asset: Asset, name: str, job: str, by_light: bool = True) -> Parts:
     """What a job works on, and what it keeps (see ``alpha.kept_apart``). Raises InputError if nothing is left to fit.
     ``name`` of the asset, and what the ``job`` does to it, for the message."""
-    asset = settled(asset)
+    asset = separate_opaque(asset)
     apart = kept_apart(asset, by_light)
     kept = tuple(m for m, out in zip(asset.meshes, apart, strict=True) if out)
     fitted = tuple(m for m, out in zip(asset.meshes, apart, strict=True) if not out)
     if not fitted:
         raise InputError(
-            f"{name}: all of it is transparent ({listed(m.material.name for m in kept)}), and transparent parts are "
-            f"kept as they are: there is nothing to {job}; materials that shall count as opaque must say so"
+            f"{name}: all of it is transparent ({list_names(m.material.name for m in kept)}), and "
+            f"transparent parts are kept as they are: there is nothing to {job}; "
+            "materials that shall count as opaque must say so"
         )
     return Parts(replace(asset, meshes=fitted) if kept else asset, kept)

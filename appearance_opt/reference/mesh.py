@@ -10,7 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 from appearance_opt.asset.alpha import seen_through
-from appearance_opt.asset.batch import Batch, replaced, smoothed
+from appearance_opt.asset.batch import Batch, fill_normals, replace_chosen
 from appearance_opt.asset.packing import EMISSION
 from appearance_opt.asset.sides import culled, single_sided
 from appearance_opt.asset.tangents import any_tangent, split_and_tangents
@@ -189,11 +189,11 @@ class SurfaceSample:
 def merge(asset: Asset, material_of: list[int], need_tangents: bool) -> MergedMesh:
     """Concatenate the meshes of an asset; computes what a mesh lacks (angle-weighted normals,
     MikkTSpace tangents where a normal map needs them, zero UVs, white vertex colours)."""
-    meshes = smoothed(asset.meshes)
+    meshes = fill_normals(asset.meshes)
     if need_tangents:
         lacking = [m.tangents is None for m in meshes]
         mapped = [m.material.normal_texture is not None and m.uvs is not None for m in meshes]
-        meshes = replaced(meshes, [a and b for a, b in zip(lacking, mapped, strict=True)], _with_tangents)
+        meshes = replace_chosen(meshes, [a and b for a, b in zip(lacking, mapped, strict=True)], _with_tangents)
     batch = Batch(meshes)
     normals = batch.joined("normals")
     tangents = None

@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 
 from appearance_opt.asset.alpha import coverage, kind_of
-from appearance_opt.asset.packing import EMISSION, resized
+from appearance_opt.asset.packing import EMISSION, resize
 from appearance_opt.render.layers import CHANNELS, Coverage
 from appearance_opt.render.material import COLORS, UNLIT, MaterialMaps, TexelLayer
 from appearance_opt.render.texture import CLAMP, MIRROR, REPEAT, Base, build_pyramid
@@ -113,7 +113,7 @@ class _Rows:
         self._texture, self._whole = texture, None
         self.there = texture is not None
         if texture is not None and texture.pixels.shape[:2] != (height, width):
-            self._whole = resized(texture.linear(), height, width)
+            self._whole = resize(texture.linear(), height, width)
 
     def at(self, start: int, stop: int) -> NDArray[np.float32]:
         """(stop - start, width, C)"""
