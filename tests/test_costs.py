@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from appearance_opt.asset import batch, load, save, usd_read, usd_write, uv_transforms, validate
+from appearance_opt.asset import batch, load, save, usd_read, usd_write, uv_unification, validate
 from appearance_opt.asset.gltf_accessors import Document
 from appearance_opt.asset.gltf_read import _Reader
 from appearance_opt.asset.notes import LINES, Notes
@@ -180,7 +180,7 @@ class CountedReads(list):
         return super().__getitem__(key)
 
 
-@pytest.mark.parametrize("place", [uv_transforms.unify, uv_transforms.keep_first_sets])
+@pytest.mark.parametrize("place", [uv_unification.unify, uv_unification.keep_first_sets])
 def test_texture_frames_take_time_in_proportion_to_materials(place) -> None:
     positions, faces, uvs = grid_sphere(2, 3)
     reads = []

@@ -61,9 +61,9 @@ def test_every_part_has_its_floor_and_none_looks_up() -> None:
     assert not above
 
 
-@pytest.mark.parametrize("part", ["", "render."])
+@pytest.mark.parametrize("part", ["", "asset.", "render."])
 def test_no_module_imports_itself_by_way_of_others(part: str) -> None:
-    """Of the renderer not for types either: what its estimators share has modules of its own."""
+    """Of files and the renderer not for types either: what they share has a module of its own."""
     known = {name: path for name, path in modules().items() if name.startswith(part)}
     assert known
     graph = {name: imports(path, known, types=bool(part)) - {name} for name, path in known.items()}

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from appearance_opt.asset import images, load, mtl, resampling, uv_transforms
+from appearance_opt.asset import images, load, mtl, resampling, uv_transforms, uv_unification
 from appearance_opt.asset.budget import BYTES, Budget
 from appearance_opt.asset.companions import Companions
 from appearance_opt.asset.polygons import MOST_CORNERS, Polygons, triangulate
@@ -125,7 +125,7 @@ def test_upright_grids_are_resampled_as_other_places_are() -> None:
 
 def test_resampled_textures_have_a_bound_together(ball: Asset, monkeypatch: pytest.MonkeyPatch) -> None:
     """Small pictures with different wrap modes, repeated often, would become large ones."""
-    monkeypatch.setattr(uv_transforms, "ASSET_TEXELS", 2 * 40 * 40)
+    monkeypatch.setattr(uv_unification, "ASSET_TEXELS", 2 * 40 * 40)
     one = Texture(np.zeros((4, 4, 3), np.uint8), "srgb")
     other = Texture(np.zeros((4, 4, 3), np.uint8), "linear", ("clamp", "clamp"))
     meshes, frames = [], {}
@@ -135,7 +135,7 @@ def test_resampled_textures_have_a_bound_together(ball: Asset, monkeypatch: pyte
         whole = uv_transforms.UvTransform(uv_transforms.affine(None))
         frames[id(material)] = {"base_color_texture": whole, "orm_texture": whole}
     notes: list[str] = []
-    uv_transforms.unify(meshes, frames, notes.append)
+    uv_unification.unify(meshes, frames, notes.append)
     assert [("too large" in n) for n in notes] == [False, True, True]
 
 

@@ -12,7 +12,7 @@ import pytest
 
 from appearance_opt.asset import Asset, load
 from appearance_opt.asset.images import encode_png
-from appearance_opt.asset.uv_transforms import bilinear
+from appearance_opt.asset.resampling import bilinear
 from tests.test_asset_gltf import write_glb
 
 WRAPS = {"repeat": 10497, "clamp": 33071, "mirror": 33648}

@@ -6,7 +6,7 @@ from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from appearance_opt.asset import images, specular_glossiness, udim, uv_transforms
+from appearance_opt.asset import images, specular_glossiness, udim, uv_transforms, uv_unification
 from appearance_opt.asset.packing import with_occlusion
 from appearance_opt.asset.types import Material, Mesh, Texture, Volume, Wrap
 from appearance_opt.errors import InputError
@@ -72,8 +72,8 @@ class MaterialReader:
         return self._materials[index]
 
     def apply_uv_transforms(self, meshes: list[Mesh], keep_layout: bool = False) -> list[Mesh]:
-        """The meshes as their textures read them; see ``uv_transforms.apply_all``."""
-        return uv_transforms.apply_all(meshes, self._transforms, self.note, self._tiles, keep_layout)
+        """The meshes as their textures read them; see ``uv_unification.apply_all``."""
+        return uv_unification.apply_all(meshes, self._transforms, self.note, self._tiles, keep_layout)
 
     def _place(self, index: int | None, tile: Tile | None = None) -> Material:
         """A material, of one tile of its textures if it has some in tiles; where they read is remembered."""

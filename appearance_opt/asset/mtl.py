@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from appearance_opt.asset import images, udim, uv_transforms
+from appearance_opt.asset import images, udim, uv_transforms, uv_unification
 from appearance_opt.asset.packing import pack_orm, with_alpha
 from appearance_opt.asset.paths import read_text
 from appearance_opt.asset.types import Material, Texture, Wrap
@@ -79,7 +79,7 @@ class _Map:
 
 class MaterialReader:
     """Materials of the MTL files of one OBJ file: ``by_name``, and by ``id`` of a material the ``transforms`` of its
-    textures (see ``uv_transforms.unify``), and what reads its ``tiles`` if they have any (see ``udim.split``)."""
+    textures (see ``uv_unification.unify``), and what reads its ``tiles`` if they have any (see ``udim.split``)."""
 
     def __init__(self, companions: Companions) -> None:
         self.companions, self.note = companions, companions.note
@@ -127,8 +127,8 @@ class MaterialReader:
         return material
 
     def apply_uv_transforms(self, meshes: list[Mesh], keep_layout: bool) -> list[Mesh]:
-        """The meshes as their textures read them; see ``uv_transforms.apply_all``."""
-        return uv_transforms.apply_all(meshes, self.transforms, self.note, self.tiles, keep_layout)
+        """The meshes as their textures read them; see ``uv_unification.apply_all``."""
+        return uv_unification.apply_all(meshes, self.transforms, self.note, self.tiles, keep_layout)
 
 
 class _Statements:

@@ -126,7 +126,8 @@ def split(
     """The meshes, those whose material is in ``readers`` (by ``id``) taken apart into their tiles.
 
     ``readers`` read the material of a tile. ``transforms_of``: by ``id`` of a material, where its textures read
-    (``uv_transforms.unify``); for the tiles' materials, which ``readers`` put there, it is moved to their unit squares.
+    (``uv_unification.unify``); for the tiles' materials, which ``readers`` put there, it is moved to
+    their unit squares.
     """
     tiles = {k: _tiles(m, next(iter(transforms_of[id(m.material)].values()))) for k, m in enumerate(meshes)
              if id(m.material) in readers and m.uvs is not None}  # fmt: skip

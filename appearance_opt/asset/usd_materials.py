@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from appearance_opt.asset import images, specular_glossiness, udim, uv_transforms
+from appearance_opt.asset import images, specular_glossiness, udim, uv_transforms, uv_unification
 from appearance_opt.asset.materialx import SURFACES, read_surface
 from appearance_opt.asset.materialx_file import find_surface
 from appearance_opt.asset.packing import pack_orm, with_alpha
@@ -316,8 +316,8 @@ class MaterialReader:
         return factor[0], texture, node, threshold
 
     def apply_uv_transforms(self, meshes: list[Mesh], keep_layout: bool = False) -> list[Mesh]:
-        """The meshes as their textures read them; see ``uv_transforms.apply_all``."""
-        return uv_transforms.apply_all(meshes, self.transforms, self.note, self.tiles, keep_layout)
+        """The meshes as their textures read them; see ``uv_unification.apply_all``."""
+        return uv_unification.apply_all(meshes, self.transforms, self.note, self.tiles, keep_layout)
 
     def _scaled(
         self, node: Any, space: str, channel: str, constant: tuple[float, float, float]
