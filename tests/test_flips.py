@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from appearance_opt.asset.normals import unit
+from appearance_opt.initial import quadrics
 from appearance_opt.initial.decimate import decimate
 from appearance_opt.initial.flips import POOR, flip_edges, quality
 
@@ -13,10 +15,15 @@ def qualities(p: np.ndarray, f: np.ndarray) -> np.ndarray:
     return quality(*(p[f[:, k]] for k in range(3)))
 
 
-def flipped(p: np.ndarray, f: list, kind: list | None = None) -> tuple[list, int]:
+def flipped(p: np.ndarray, f: list, kind: list | None = None, original: list | None = None) -> tuple[list, int]:
+    """``original``: faces over the same vertices whose planes the quadrics stand for; none by default."""
     p, f = np.asarray(p, float), np.asarray(f)
     kind = np.zeros(len(f)) if kind is None else np.array(kind)
-    faces, count = flip_edges(p, f, kind)
+    q = np.zeros((len(p), quadrics.SIZE))
+    for face in original or []:
+        a, b, c = p[list(face)]
+        q[list(face)] += quadrics.of_planes(unit(np.cross(b - a, c - a))[None], a[None], np.ones(1))
+    faces, count = flip_edges(p, f, kind, q)
     return [tuple(np.roll(x, -int(np.argmin(x))).tolist()) for x in faces], count
 
 
@@ -57,9 +64,17 @@ def test_what_is_no_flat_pair_stays(reason: str) -> None:
 
 def test_a_bend_stays() -> None:
     """The diagonals lie ``height`` apart, over an area of 0.2: a share of 0.001 for 0.0005, and 0.01 for 0.005."""
+    old = [(0, 1, 2), (1, 0, 3)]
     for height, count in [(0.0005, 1), (0.005, 0)]:
         p = [*KITE[:2], (0, 0.1, height), (0, -0.1, height)]
-        assert flipped(p, [(0, 1, 2), (1, 0, 3)])[1] == count
+        assert flipped(p, old, original=old)[1] == count
+
+
+@pytest.mark.parametrize(("height", "count"), [(0.005, 1), (0.03, 1), (0.1, 0)])
+def test_an_edge_across_the_original_surface_is_flipped(height: float, count: int) -> None:
+    """The original is bent along the other diagonal; the heights of the thinner triangles are 0.1 and more."""
+    p, other = [*KITE[:2], (0, 0.1, height), (0, -0.1, height)], [(0, 3, 2), (1, 2, 3)]
+    assert flipped(p, [(0, 1, 2), (1, 0, 3)], original=other)[1] == count
 
 
 def test_a_fan_over_a_strip_becomes_a_zigzag() -> None:
@@ -70,7 +85,7 @@ def test_a_fan_over_a_strip_becomes_a_zigzag() -> None:
     low = [(k, k + 1, 2 * n + 1) for k in range(n)]
     high = [(0, n + 2 + k, n + 1 + k) for k in range(n)]
     f = np.array([*low, *high])
-    g, count = flip_edges(p, f, np.zeros(len(f)))
+    g, count = flip_edges(p, f, np.zeros(len(f)), np.zeros((len(p), quadrics.SIZE)))
     assert (qualities(p, f) < 0.1).sum() >= 4
     assert count > 10
     assert qualities(p, g).min() > POOR

@@ -111,7 +111,7 @@ def decimate_with_source(
             pass
     if len(state.faces) > triangles:
         state.keep(np.zeros(len(state.faces), bool))
-    state.faces, _ = flip_edges(state.positions, state.faces, single[state.source])
+    state.faces, _ = flip_edges(state.positions, state.faces, single[state.source], state.quadrics)
     used, compact = np.unique(state.faces, return_inverse=True)
     return state.positions[used] * scale + centre, compact.reshape(-1, 3).astype(np.int32), state.source
 
