@@ -7,7 +7,13 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from appearance_opt.asset import load, save
     from appearance_opt.config import BakeOptions, SimplifyOptions, bake_options, simplify_options
-    from appearance_opt.errors import AppearanceError, BackendError, DivergedError, InputError, ReferenceRenderError
+    from appearance_opt.errors import (
+        AppearanceError,
+        BackendError,
+        DivergedError,
+        InputError,
+        ReferenceRenderError,
+    )
     from appearance_opt.jobs.bake import bake
     from appearance_opt.jobs.compare import compare
     from appearance_opt.jobs.inspect import inspect

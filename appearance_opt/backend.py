@@ -47,7 +47,9 @@ def select(device: str = "auto") -> Backend:
 
     cuda = bool(dr.has_backend(dr.JitBackend.CUDA))
     if device == "cuda" and not cuda:
-        raise BackendError("no CUDA device was found: install NVIDIA's driver (R535 or newer), or use --device cpu")
+        raise BackendError(
+            "no CUDA device was found: install NVIDIA's driver (R535 or newer), or use --device cpu"
+        )
     variant = CUDA if device == "cuda" or (device == "auto" and cuda) else CPU
     version = None
     if variant == CPU:
@@ -56,7 +58,9 @@ def select(device: str = "auto") -> Backend:
         numbers = dr.detail.llvm_version()
         version = ".".join(str(n) for n in numbers)
         if numbers[0] < MINIMUM_LLVM:
-            raise BackendError(f"libLLVM {version} is too old ({MINIMUM_LLVM} or newer is needed): {install_hint()}")
+            raise BackendError(
+                f"libLLVM {version} is too old ({MINIMUM_LLVM} or newer is needed): {install_hint()}"
+            )
     _limit_threads()
     if mi.variant() != variant:
         mi.set_variant(variant)
@@ -69,8 +73,9 @@ def cores() -> int:
 
 
 def _limit_threads() -> None:
-    """Let Dr.Jit (and Mitsuba's Embree, which shares its threads) take no more threads than ``THREADS`` says, or than
-    a container's share of the processors (cgroup v2) can run at a time: more would wait for each other."""
+    """Let Dr.Jit (and Mitsuba's Embree, which shares its threads) take no more threads than
+    ``THREADS`` says, or than a container's share of the processors (cgroup v2) can run at a time:
+    more would wait for each other."""
     import drjit as dr
 
     given = os.environ.get(THREADS, "").strip()
@@ -79,13 +84,16 @@ def _limit_threads() -> None:
             raise BackendError(f"{THREADS}={given}: must be a whole number of threads, at least 1")
         limit = min(int(given), cores())
     else:
-        limit = min(dr.thread_count(), _processor_quota(Path("/sys/fs/cgroup/cpu.max")) or dr.thread_count())
+        limit = min(
+            dr.thread_count(), _processor_quota(Path("/sys/fs/cgroup/cpu.max")) or dr.thread_count()
+        )
     if dr.thread_count() != limit:
         dr.set_thread_count(limit)
 
 
 def _processor_quota(file: Path) -> int | None:
-    """Processors, rounded up, that a container may use at a time, or None where there is no limit."""
+    """Processors, rounded up, that a container may use at a time, or None where there is no
+    limit."""
     try:
         quota, period = file.read_text().split()
         return max(1, math.ceil(int(quota) / int(period)))
@@ -96,8 +104,8 @@ def _processor_quota(file: Path) -> int | None:
 def to_device(array: NDArray) -> mi.Float:
     """Upload numbers (any shape, flattened) into memory of Dr.Jit's own.
 
-    A bare ``mi.Float(array)`` may go on using NumPy's memory, whose alignment varies from call to call, and the
-    kernels that read it are compiled for the one or the other.
+    A bare ``mi.Float(array)`` may go on using NumPy's memory, whose alignment varies from call to
+    call, and the kernels that read it are compiled for the one or the other.
     """
     import drjit as dr
     import mitsuba as mi
@@ -134,7 +142,16 @@ def install_hint() -> str:
 def versions() -> dict[str, str]:
     """Versions of what results depend on."""
     out = {"python": platform.python_version()}
-    for name in ("appearance-opt", "drjit", "mitsuba", "numpy", "usd-core", "OpenImageIO", "xatlas", "flip-evaluator"):
+    for name in (
+        "appearance-opt",
+        "drjit",
+        "mitsuba",
+        "numpy",
+        "usd-core",
+        "OpenImageIO",
+        "xatlas",
+        "flip-evaluator",
+    ):
         try:
             out[name] = metadata.version(name)
         except metadata.PackageNotFoundError:

@@ -47,19 +47,23 @@ def main() -> None:
         code = app(standalone_mode=False)
         if code == INTERRUPTED:  # how typer hands on a Ctrl-C
             raise KeyboardInterrupt
-        # all is done: a Ctrl-C while the interpreter takes itself apart must not look like a failure
+        # all is done: a Ctrl-C while the interpreter takes itself apart must not look like a
+        # failure
         signal.signal(signal.SIGINT, signal.SIG_IGN)
     except AppearanceError as error:
         _fail(str(error))
     except OSError as error:
-        reason = "the disk is full" if error.errno == errno.ENOSPC else (error.strerror or str(error))
+        reason = (
+            "the disk is full" if error.errno == errno.ENOSPC else (error.strerror or str(error))
+        )
         _fail(f"{error.filename or 'file'}: {reason}")
     except KeyboardInterrupt:
         _fail(INTERRUPTION, INTERRUPTED)
     except MemoryError:
         _fail("not enough memory; try a smaller --texture-size, --resolution or --pool")
     except Exception as error:
-        # the parser's own errors (typer may bundle its parser, so they are known by what they can do)
+        # the parser's own errors (typer may bundle its parser, so they are known by what they can
+        # do)
         if type(error).__name__ == "Abort":  # a Ctrl-C, in other versions of typer
             _fail(INTERRUPTION, INTERRUPTED)
         if not hasattr(error, "format_message"):
@@ -80,34 +84,47 @@ def _version(show: bool) -> None:
 
 # options that mean the same in several commands
 PresetOption = Annotated[str | None, typer.Option(help="draft, default or final.")]
-TextureSizeOption = Annotated[int | None, typer.Option(help="Texels per side of the maps (power of two).")]
+TextureSizeOption = Annotated[
+    int | None, typer.Option(help="Texels per side of the maps (power of two).")
+]
 ResolutionOption = Annotated[int | None, typer.Option(help="Pixels per side of a training view.")]
 ViewsOption = Annotated[int | None, typer.Option(help="Views per step.")]
 PoolOption = Annotated[int | None, typer.Option(help="Reference views kept at a time.")]
 ReuseOption = Annotated[
-    int | None, typer.Option(help="How often each view is seen before a new one replaces it; 0: they stay.")
+    int | None,
+    typer.Option(help="How often each view is seen before a new one replaces it; 0: they stay."),
 ]
 StepsOption = Annotated[int | None, typer.Option(help="Stop after this many steps.")]
 BudgetOption = Annotated[str | None, typer.Option(help="Wall-clock time for everything: 60s, 5m.")]
 NormalRateOption = Annotated[float | None, typer.Option(help="Learning rate of the normal map.")]
 ColorRateOption = Annotated[float | None, typer.Option(help="Learning rate of the base colour.")]
-MaterialRateOption = Annotated[float | None, typer.Option(help="Learning rate of roughness, metalness.")]
+MaterialRateOption = Annotated[
+    float | None, typer.Option(help="Learning rate of roughness, metalness.")
+]
 BackgroundOption = Annotated[str | None, typer.Option(help="random, black, white, grey or r,g,b.")]
 LightOption = Annotated[str | None, typer.Option(help="point (random) or headlight.")]
 SeedOption = Annotated[int | None, typer.Option(help="Seed of views and lights.")]
-RefineOption = Annotated[int | None, typer.Option(help="Level to which USD subdivision surfaces are refined.")]
+RefineOption = Annotated[
+    int | None, typer.Option(help="Level to which USD subdivision surfaces are refined.")
+]
 MissingTexturesOption = Annotated[
-    str | None, typer.Option(help="error or ignore, when the input names a texture that is not there.")
+    str | None,
+    typer.Option(help="error or ignore, when the input names a texture that is not there."),
 ]
 CreaseAngleOption = Annotated[
     float | None,
-    typer.Option(help="STL, PLY, OBJ without normals: edges sharper than this (degrees) are hard [40, more in noise]."),
+    typer.Option(
+        help="STL, PLY, OBJ without normals: edges sharper than this (degrees) are hard [40, more in noise]."
+    ),
 ]
 RootOption = Annotated[
-    str | None, typer.Option(help="Folder in which files that the input refers to may lie, beside its own.")
+    str | None,
+    typer.Option(help="Folder in which files that the input refers to may lie, beside its own."),
 ]
 DeviceOption = Annotated[str | None, typer.Option(help="auto, cpu or cuda.")]
-ReportOption = Annotated[Path | None, typer.Option(help="Folder for the report [OUT's name + .report].")]
+ReportOption = Annotated[
+    Path | None, typer.Option(help="Folder for the report [OUT's name + .report].")
+]
 NoReportOption = Annotated[bool, typer.Option("--no-report", help="Write no report.")]
 ConfigOption = Annotated[Path | None, typer.Option(help="TOML file with the same keys.")]
 
@@ -123,10 +140,14 @@ def _root(
 
 @app.command()
 def simplify(
-    source: Annotated[Path, typer.Argument(metavar="INPUT", help=".glb .gltf .usd* .obj .ply .stl")],
+    source: Annotated[
+        Path, typer.Argument(metavar="INPUT", help=".glb .gltf .usd* .obj .ply .stl")
+    ],
     out: Annotated[Path, typer.Option(help="Result: .glb .gltf .usd* .obj")],
     triangles: Annotated[int | None, typer.Option(help="At most this many triangles.")] = None,
-    ratio: Annotated[float | None, typer.Option(help="Fraction of the input's triangles instead.")] = None,
+    ratio: Annotated[
+        float | None, typer.Option(help="Fraction of the input's triangles instead.")
+    ] = None,
     preset: PresetOption = None,
     texture_size: TextureSizeOption = None,
     resolution: ResolutionOption = None,
@@ -136,25 +157,45 @@ def simplify(
     steps: StepsOption = None,
     budget: BudgetOption = None,
     fit: Annotated[str | None, typer.Option(help="Subset of shape,normal,material.")] = None,
-    init: Annotated[str | None, typer.Option(help="decimate, sphere, or a file to start from.")] = None,
-    reallocate: Annotated[int | None, typer.Option(help="Rounds of moving triangles to the image error.")] = None,
-    loss: Annotated[str | None, typer.Option(help="log-srgb-l1, log-srgb-l2, l1, l2, smape, relative-l2.")] = None,
-    laplacian: Annotated[float | None, typer.Option(help="Weight of the Laplacian (0: off).")] = None,
+    init: Annotated[
+        str | None, typer.Option(help="decimate, sphere, or a file to start from.")
+    ] = None,
+    reallocate: Annotated[
+        int | None, typer.Option(help="Rounds of moving triangles to the image error.")
+    ] = None,
+    loss: Annotated[
+        str | None, typer.Option(help="log-srgb-l1, log-srgb-l2, l1, l2, smape, relative-l2.")
+    ] = None,
+    laplacian: Annotated[
+        float | None, typer.Option(help="Weight of the Laplacian (0: off).")
+    ] = None,
     relative: Annotated[
         bool | None, typer.Option("--relative/--absolute", help="Laplacian of the start, or 0.")
     ] = None,
-    position_rate: Annotated[float | None, typer.Option(help="In units of the local edge length.")] = None,
+    position_rate: Annotated[
+        float | None, typer.Option(help="In units of the local edge length.")
+    ] = None,
     normal_rate: NormalRateOption = None,
     color_rate: ColorRateOption = None,
     material_rate: MaterialRateOption = None,
     background: BackgroundOption = None,
     light: LightOption = None,
     seed: SeedOption = None,
-    keep_hidden: Annotated[bool | None, typer.Option(help="Keep geometry that nobody sees.")] = None,
-    displacement: Annotated[bool | None, typer.Option("--displacement", help="Fit a displacement map.")] = None,
-    subdivision: Annotated[str | None, typer.Option(help="Tessellation, 0 to 4: 3, or 1,2,3 for all of them.")] = None,
-    displacement_rate: Annotated[float | None, typer.Option(help="In units of the finest edge length.")] = None,
-    write_tessellated: Annotated[bool | None, typer.Option("--write-tessellated", help="Write them, too.")] = None,
+    keep_hidden: Annotated[
+        bool | None, typer.Option(help="Keep geometry that nobody sees.")
+    ] = None,
+    displacement: Annotated[
+        bool | None, typer.Option("--displacement", help="Fit a displacement map.")
+    ] = None,
+    subdivision: Annotated[
+        str | None, typer.Option(help="Tessellation, 0 to 4: 3, or 1,2,3 for all of them.")
+    ] = None,
+    displacement_rate: Annotated[
+        float | None, typer.Option(help="In units of the finest edge length.")
+    ] = None,
+    write_tessellated: Annotated[
+        bool | None, typer.Option("--write-tessellated", help="Write them, too.")
+    ] = None,
     normal_map: Annotated[bool | None, typer.Option(help="Make a normal map at all.")] = None,
     refine: RefineOption = None,
     missing_textures: MissingTexturesOption = None,
@@ -205,26 +246,46 @@ def simplify(
 @app.command()
 def bake(
     high: Annotated[Path, typer.Argument(metavar="HIGH", help="What it shall look like.")],
-    low: Annotated[Path, typer.Argument(metavar="LOW", help="Keeps its shape and its texture coordinates.")],
+    low: Annotated[
+        Path, typer.Argument(metavar="LOW", help="Keeps its shape and its texture coordinates.")
+    ],
     out: Annotated[Path, typer.Option(help="Result: .glb .gltf .usd* .obj")],
     maps: Annotated[
         str | None,
-        typer.Option(help="normal,material,base-color,orm,emission,displacement,object-normal,ao,curvature."),
+        typer.Option(
+            help="normal,material,base-color,orm,emission,displacement,object-normal,ao,curvature."
+        ),
     ] = None,
-    closed_form: Annotated[bool | None, typer.Option("--closed-form", help="Rays alone, no fit: seconds.")] = None,
+    closed_form: Annotated[
+        bool | None, typer.Option("--closed-form", help="Rays alone, no fit: seconds.")
+    ] = None,
     fit: Annotated[str | None, typer.Option(help="Subset of normal,material.")] = None,
     preset: PresetOption = None,
     texture_size: TextureSizeOption = None,
     samples: Annotated[int | None, typer.Option(help="Rays per texel.")] = None,
-    cage: Annotated[float | None, typer.Option(help="How far rays go, metres [from the two meshes].")] = None,
+    cage: Annotated[
+        float | None, typer.Option(help="How far rays go, metres [from the two meshes].")
+    ] = None,
     hit: Annotated[str | None, typer.Option(help="nearest or outermost surface.")] = None,
-    green: Annotated[str | None, typer.Option(help="Green of loose normal maps: opengl or directx.")] = None,
-    bits: Annotated[int | None, typer.Option(help="8 or 16, of normal maps and loose maps.")] = None,
+    green: Annotated[
+        str | None, typer.Option(help="Green of loose normal maps: opengl or directx.")
+    ] = None,
+    bits: Annotated[
+        int | None, typer.Option(help="8 or 16, of normal maps and loose maps.")
+    ] = None,
     texture_format: Annotated[str | None, typer.Option(help="Of loose maps: png or exr.")] = None,
-    ao_rays: Annotated[int | None, typer.Option(help="Rays per sample of ambient occlusion.")] = None,
-    ao_distance: Annotated[float | None, typer.Option(help="Reach of ambient occlusion, metres [any].")] = None,
-    unwrap: Annotated[bool | None, typer.Option("--unwrap", help="Make a new atlas for LOW.")] = None,
-    align: Annotated[bool | None, typer.Option("--align", help="Fit HIGH to LOW: translation, scale.")] = None,
+    ao_rays: Annotated[
+        int | None, typer.Option(help="Rays per sample of ambient occlusion.")
+    ] = None,
+    ao_distance: Annotated[
+        float | None, typer.Option(help="Reach of ambient occlusion, metres [any].")
+    ] = None,
+    unwrap: Annotated[
+        bool | None, typer.Option("--unwrap", help="Make a new atlas for LOW.")
+    ] = None,
+    align: Annotated[
+        bool | None, typer.Option("--align", help="Fit HIGH to LOW: translation, scale.")
+    ] = None,
     resolution: ResolutionOption = None,
     views: ViewsOption = None,
     pool: PoolOption = None,
@@ -244,12 +305,24 @@ def bake(
     crease_angle: CreaseAngleOption = None,
     variant: Annotated[list[str] | None, typer.Option(help=f"HIGH: {VARIANT}")] = None,
     device: DeviceOption = None,
-    joint: Annotated[bool | None, typer.Option("--joint", help="Fit LOW's shape and a displacement, too.")] = None,
-    subdivision: Annotated[str | None, typer.Option(help="Tessellation with --joint: 3, or 1,2,3.")] = None,
-    position_rate: Annotated[float | None, typer.Option(help="With --joint: as for simplify.")] = None,
-    displacement_rate: Annotated[float | None, typer.Option(help="With --joint: as for simplify.")] = None,
-    write_tessellated: Annotated[bool | None, typer.Option("--write-tessellated", help="With --joint.")] = None,
-    textures: Annotated[Path | None, typer.Option(help="Folder for the maps as loose files.")] = None,
+    joint: Annotated[
+        bool | None, typer.Option("--joint", help="Fit LOW's shape and a displacement, too.")
+    ] = None,
+    subdivision: Annotated[
+        str | None, typer.Option(help="Tessellation with --joint: 3, or 1,2,3.")
+    ] = None,
+    position_rate: Annotated[
+        float | None, typer.Option(help="With --joint: as for simplify.")
+    ] = None,
+    displacement_rate: Annotated[
+        float | None, typer.Option(help="With --joint: as for simplify.")
+    ] = None,
+    write_tessellated: Annotated[
+        bool | None, typer.Option("--write-tessellated", help="With --joint.")
+    ] = None,
+    textures: Annotated[
+        Path | None, typer.Option(help="Folder for the maps as loose files.")
+    ] = None,
     report: ReportOption = None,
     no_report: NoReportOption = False,
     config: ConfigOption = None,
@@ -269,7 +342,9 @@ def bake(
     folder = None if no_report else report or out.with_name(out.stem + ".report")
     if options.joint:
         if textures is not None:
-            raise InputError(f"--textures {textures}: a joint bake writes no loose maps; leave it out")
+            raise InputError(
+                f"--textures {textures}: a joint bake writes no loose maps; leave it out"
+            )
         from appearance_opt.jobs.joint import joint as run_joint
 
         with TerminalProgress() as progress:
@@ -321,7 +396,9 @@ def compare(
     resolution: Annotated[int, typer.Option(help="Pixels per side.", min=16)] = 384,
     seed: Annotated[int, typer.Option(help="Seed of views and lights.")] = 0,
     device: Annotated[str, typer.Option(help="auto, cpu or cuda.")] = "auto",
-    refine: Annotated[int, typer.Option(help="Level to which USD subdivision surfaces are refined.")] = 1,
+    refine: Annotated[
+        int, typer.Option(help="Level to which USD subdivision surfaces are refined.")
+    ] = 1,
     missing_textures: MissingTexturesOption = "error",
     root: RootOption = None,
     crease_angle: CreaseAngleOption = None,
@@ -362,15 +439,20 @@ def compare(
 
 @app.command()
 def inspect(
-    source: Annotated[Path, typer.Argument(metavar="INPUT", help=".glb .gltf .usd* .obj .ply .stl")],
+    source: Annotated[
+        Path, typer.Argument(metavar="INPUT", help=".glb .gltf .usd* .obj .ply .stl")
+    ],
     as_json: Annotated[bool, typer.Option("--json", help="Print as JSON.")] = False,
-    refine: Annotated[int, typer.Option(help="Level to which USD subdivision surfaces are refined.")] = 1,
+    refine: Annotated[
+        int, typer.Option(help="Level to which USD subdivision surfaces are refined.")
+    ] = 1,
     missing_textures: MissingTexturesOption = "error",
     root: RootOption = None,
     crease_angle: CreaseAngleOption = None,
     variant: Annotated[list[str] | None, typer.Option(help=VARIANT)] = None,
 ) -> None:
-    """Say what is in an asset, what is wrong with it, and what simplify will do with each material."""
+    """Say what is in an asset, what is wrong with it, and what simplify will do with each
+    material."""
     from appearance_opt.jobs.inspect import inspect as run
 
     found = run(
@@ -411,7 +493,11 @@ def _print_result(out: Path, result: Any, folder: Path | None) -> None:
     for note in result.notes:
         print(f"note: {note}", file=sys.stderr)
     curve = result.fit.curve
-    quality = f", held-out PSNR {curve[0].psnr:.2f} -> {max(p.psnr for p in curve):.2f} dB" if curve else ""
+    quality = (
+        f", held-out PSNR {curve[0].psnr:.2f} -> {max(p.psnr for p in curve):.2f} dB"
+        if curve
+        else ""
+    )
     kept = f" and {result.kept_triangles} kept as they are" if result.kept_triangles else ""
     counts = f"{result.triangles} of {result.source_triangles} triangles{kept}"
     print(f"{out}: {counts}, {result.seconds['total']:.1f} s{quality}")

@@ -22,7 +22,17 @@ BACKGROUNDS = ("random", "black", "white", "grey")
 LIGHTS = ("point", "headlight")
 DEVICES = ("auto", "cpu", "cuda")
 MAX_SUBDIVISION, DEFAULT_SUBDIVISION = 4, 3
-MAPS = ("normal", "material", "base-color", "orm", "displacement", "object-normal", "ao", "curvature", "emission")
+MAPS = (
+    "normal",
+    "material",
+    "base-color",
+    "orm",
+    "displacement",
+    "object-normal",
+    "ao",
+    "curvature",
+    "emission",
+)
 HITS = ("nearest", "outermost")
 GREENS = ("opengl", "directx")
 TEXTURE_FORMATS = ("png", "exr")
@@ -32,24 +42,25 @@ PRESETS: dict[str, dict[str, Any]] = {
     "default": {"budget": 65.0, "resolution": 256, "reallocate": 1},
     "final": {"budget": 280.0, "resolution": 320, "reallocate": 2},
 }
-"""What each preset sets; everything else keeps its default. See docs/performance.md for how they were
-chosen."""
+"""What each preset sets; everything else keeps its default. See docs/performance.md for how they
+were chosen."""
 
 
 @dataclass(frozen=True)
 class CommonOptions:
     """What all jobs that fit share.
 
-    ``texture_size``: texels per side of the new maps, a power of two. ``resolution``, ``views``: pixels per side and
-    views of a step. ``steps``, ``budget`` (seconds for the whole job, set-up and report included): when to stop;
-    whichever comes first. ``pool``: reference views that are kept at a time; ``reuse``: how often each is seen before
-    a new one takes its place (0: they stay). ``fit``: what moves. ``*_rate``: learning rates, positions in units of
-    the local edge length; by default they follow from how good the start is. ``refine``: level for USD subdivision
-    surfaces. ``missing_textures``: "error" or "ignore", when an input names a texture that is not there.
-    ``root``: folder in which files that inputs refer to may lie, beside their own. ``crease_angle``: see
-    ``asset.load``, in degrees. ``seed``: of everything random.
-    ``subdivision``: tessellation levels of a displaced result (none given: 3); ``write_tessellated``: write those
-    meshes, too. Raises InputError for values that make no sense.
+    ``texture_size``: texels per side of the new maps, a power of two. ``resolution``, ``views``:
+    pixels per side and views of a step. ``steps``, ``budget`` (seconds for the whole job, set-up
+    and report included): when to stop; whichever comes first. ``pool``: reference views that are
+    kept at a time; ``reuse``: how often each is seen before a new one takes its place (0: they
+    stay). ``fit``: what moves. ``*_rate``: learning rates, positions in units of the local edge
+    length; by default they follow from how good the start is. ``refine``: level for USD subdivision
+    surfaces. ``missing_textures``: "error" or "ignore", when an input names a texture that is not
+    there. ``root``: folder in which files that inputs refer to may lie, beside their own.
+    ``crease_angle``: see ``asset.load``, in degrees. ``seed``: of everything random.
+    ``subdivision``: tessellation levels of a displaced result (none given: 3);
+    ``write_tessellated``: write those meshes, too. Raises InputError for values that make no sense.
     """
 
     texture_size: int = 1024
@@ -79,22 +90,42 @@ class CommonOptions:
 
     def __post_init__(self) -> None:
         size = self.texture_size
-        _require(16 <= size <= 8192 and size & (size - 1) == 0, "texture-size", size, "a power of two from 16 to 8192")
+        _require(
+            16 <= size <= 8192 and size & (size - 1) == 0,
+            "texture-size",
+            size,
+            "a power of two from 16 to 8192",
+        )
         _require(16 <= self.resolution <= 4096, "resolution", self.resolution, "from 16 to 4096")
         _require(1 <= self.views <= 64, "views", self.views, "from 1 to 64")
         _require(self.pool >= self.views, "pool", self.pool, "at least as many as --views")
         _require(self.reuse >= 0, "reuse", self.reuse, "0 or more")
         _require(self.steps is None or self.steps >= 0, "steps", self.steps, "0 or more")
-        _require(self.budget is None or self.budget > 0, "budget", self.budget, "a positive time such as 60s")
+        _require(
+            self.budget is None or self.budget > 0,
+            "budget",
+            self.budget,
+            "a positive time such as 60s",
+        )
         _require(self.seed >= 0, "seed", self.seed, "0 or more")
         _require(0 <= self.refine <= 5, "refine", self.refine, "from 0 to 5")
         angle = self.crease_angle
         _require(angle is None or 0 <= angle <= 180, "crease-angle", angle, "from 0 to 180 degrees")
         for level in self.subdivision:
-            _require(0 <= level <= MAX_SUBDIVISION, "subdivision", level, f"from 0 to {MAX_SUBDIVISION}")
-        _require(self.displaced or not self.subdivision, "subdivision", self.subdivision, self._needs)
+            _require(
+                0 <= level <= MAX_SUBDIVISION, "subdivision", level, f"from 0 to {MAX_SUBDIVISION}"
+            )
+        _require(
+            self.displaced or not self.subdivision, "subdivision", self.subdivision, self._needs
+        )
         _require(self.displaced or not self.write_tessellated, "write-tessellated", "", self._needs)
-        for name in ("position_rate", "normal_rate", "color_rate", "material_rate", "displacement_rate"):
+        for name in (
+            "position_rate",
+            "normal_rate",
+            "color_rate",
+            "material_rate",
+            "displacement_rate",
+        ):
             rate = getattr(self, name)
             _require(rate is None or 0 <= rate <= 1, name.replace("_", "-"), rate, "from 0 to 1")
         _require(bool(self.fit), "fit", "", f"some of {', '.join(FIT_PARTS)}")
@@ -140,12 +171,12 @@ class CommonOptions:
 class SimplifyOptions(CommonOptions):
     """How to simplify.
 
-    ``triangles`` or ``ratio``: the budget (exactly one; neither is needed where
-    ``init`` is a file). ``init``: "decimate", "sphere", or a file with a start.
-    ``reallocate``: rounds in which triangles are moved to where the image error of the decimated mesh is.
-    ``relative``: the Laplacian keeps the start's shape; None: where the start is a likeness of the input.
-    ``keep_hidden``: keep geometry that no outside view sees. ``displacement``: fit a displacement map on the
-    tessellated mesh; ``normal_map``: make one at all. The others: ``CommonOptions``.
+    ``triangles`` or ``ratio``: the budget (exactly one; neither is needed where ``init`` is a
+    file). ``init``: "decimate", "sphere", or a file with a start. ``reallocate``: rounds in which
+    triangles are moved to where the image error of the decimated mesh is. ``relative``: the
+    Laplacian keeps the start's shape; None: where the start is a likeness of the input.
+    ``keep_hidden``: keep geometry that no outside view sees. ``displacement``: fit a displacement
+    map on the tessellated mesh; ``normal_map``: make one at all. The others: ``CommonOptions``.
     """
 
     triangles: int | None = None
@@ -166,7 +197,9 @@ class SimplifyOptions(CommonOptions):
 
     def __post_init__(self) -> None:
         given = (self.triangles is not None) + (self.ratio is not None)
-        if given != 1 and (self.init in INITS or given):  # a file to start from brings its own triangles
+        if given != 1 and (
+            self.init in INITS or given
+        ):  # a file to start from brings its own triangles
             raise InputError("give either --triangles N or --ratio R")
         if self.triangles is not None:
             _require(self.triangles >= 1, "triangles", self.triangles, "at least 1")
@@ -183,13 +216,14 @@ class SimplifyOptions(CommonOptions):
 class BakeOptions(CommonOptions):
     """How to bake.
 
-    ``maps``: any of ``MAPS``; "material" is base-color, orm and, if HIGH emits any, emission. ``closed_form``: no fit.
-    ``samples``: rays per texel. ``cage``: how far rays go outward and inward (metres), by default from the two meshes.
-    ``hit``: "nearest" or "outermost" surface that faces the texel's way. ``green``: green channel of loose normal maps,
-    "opengl" or "directx". ``bits``: 8 or 16, of normal maps and of loose maps. ``texture_format``: png or exr, of loose
-    maps. ``ao_rays``, ``ao_distance`` (metres; by default any): ambient occlusion. ``unwrap``: make LOW a new atlas.
-    ``align``: fit HIGH to LOW by translation and scale. ``joint``: fit LOW's shape and a displacement map as well.
-    The others: ``CommonOptions``; ``fit``: of normal,material.
+    ``maps``: any of ``MAPS``; "material" is base-color, orm and, if HIGH emits any, emission.
+    ``closed_form``: no fit. ``samples``: rays per texel. ``cage``: how far rays go outward and
+    inward (metres), by default from the two meshes. ``hit``: "nearest" or "outermost" surface that
+    faces the texel's way. ``green``: green channel of loose normal maps, "opengl" or "directx".
+    ``bits``: 8 or 16, of normal maps and of loose maps. ``texture_format``: png or exr, of loose
+    maps. ``ao_rays``, ``ao_distance`` (metres; by default any): ambient occlusion. ``unwrap``: make
+    LOW a new atlas. ``align``: fit HIGH to LOW by translation and scale. ``joint``: fit LOW's shape
+    and a displacement map as well. The others: ``CommonOptions``; ``fit``: of normal,material.
     """
 
     maps: tuple[str, ...] = ("normal", "material")
@@ -224,29 +258,49 @@ class BakeOptions(CommonOptions):
             _choice("maps", name, MAPS)
         for part in self.fit:
             shape = part == "shape" and self.joint
-            _require(shape or part in ("normal", "material"), "fit", part, "of normal,material: LOW keeps its shape")
+            _require(
+                shape or part in ("normal", "material"),
+                "fit",
+                part,
+                "of normal,material: LOW keeps its shape",
+            )
         _require(1 <= self.samples <= 64, "samples", self.samples, "from 1 to 64")
-        _require(self.cage is None or self.cage > 0, "cage", self.cage, "a positive distance in metres")
+        _require(
+            self.cage is None or self.cage > 0, "cage", self.cage, "a positive distance in metres"
+        )
         _choice("hit", self.hit, HITS)
         _choice("green", self.green, GREENS)
         _choice("texture-format", self.texture_format, TEXTURE_FORMATS)
         _require(self.bits in (8, 16), "bits", self.bits, "8 or 16")
         _require(1 <= self.ao_rays <= 4096, "ao-rays", self.ao_rays, "from 1 to 4096")
-        _require(self.ao_distance is None or self.ao_distance > 0, "ao-distance", self.ao_distance, "above 0")
+        _require(
+            self.ao_distance is None or self.ao_distance > 0,
+            "ao-distance",
+            self.ao_distance,
+            "above 0",
+        )
 
     def _check_joint(self) -> None:
-        """A joint bake makes a base mesh with normal map, material and displacement, nothing loose."""
+        """A joint bake makes a base mesh with normal map, material and displacement, nothing
+        loose."""
         _require(not self.closed_form, "joint", "", "given without --closed-form")
         made = {"normal", "material", "displacement"}
         asked = set(self.maps)
-        _require({"normal", "material"} <= asked <= made, "maps", ",".join(self.maps), "normal,material with --joint")
+        _require(
+            {"normal", "material"} <= asked <= made,
+            "maps",
+            ",".join(self.maps),
+            "normal,material with --joint",
+        )
         for name in ("hit", "green", "bits", "texture_format", "ao_rays", "ao_distance"):
             plain = getattr(self, name) == getattr(BakeOptions, name)
             _require(plain, name.replace("_", "-"), getattr(self, name), "given without --joint")
 
     def wants(self, name: str) -> bool:
         """Is a map asked for? "material" is base-color, orm and emission."""
-        return name in self.maps or ("material" in self.maps and name in ("base-color", "orm", "emission"))
+        return name in self.maps or (
+            "material" in self.maps and name in ("base-color", "orm", "emission")
+        )
 
 
 OPTION_NAMES = frozenset(f.name for f in fields(SimplifyOptions))
@@ -254,7 +308,8 @@ BAKE_OPTION_NAMES = frozenset(f.name for f in fields(BakeOptions))
 
 
 def simplify_options(preset: str = "default", **values: Any) -> SimplifyOptions:
-    """Options from a preset and what overrides it. Raises InputError for unknown names and bad values."""
+    """Options from a preset and what overrides it. Raises InputError for unknown names and bad
+    values."""
     return SimplifyOptions(**_merge(SimplifyOptions, OPTION_NAMES, preset, values))
 
 
@@ -263,7 +318,9 @@ def bake_options(preset: str = "default", **values: Any) -> BakeOptions:
     return BakeOptions(**_merge(BakeOptions, BAKE_OPTION_NAMES, preset, values))
 
 
-def _merge(kind: type, known: frozenset[str], preset: str, values: Mapping[str, Any]) -> dict[str, Any]:
+def _merge(
+    kind: type, known: frozenset[str], preset: str, values: Mapping[str, Any]
+) -> dict[str, Any]:
     _choice("preset", preset, tuple(PRESETS))
     for name in values:
         if name not in known:
@@ -276,7 +333,8 @@ def _merge(kind: type, known: frozenset[str], preset: str, values: Mapping[str, 
 
 
 def read_toml(path: Path, names: frozenset[str] = OPTION_NAMES) -> dict[str, Any]:
-    """Keys of a job file, dashes or underscores. Raises InputError for unknown keys, suggesting the nearest."""
+    """Keys of a job file, dashes or underscores. Raises InputError for unknown keys, suggesting the
+    nearest."""
     if sys.version_info >= (3, 11):
         import tomllib
     else:
@@ -328,25 +386,40 @@ def _convert(kind: type, name: str, value: Any) -> Any:
         return tuple(dict.fromkeys(p.strip() for p in parts if p.strip()))
     if name == "subdivision":
         return _levels(value)
-    kinds: Mapping[str, tuple[type, ...]] = {"int": (int,), "float": (int, float), "str": (str,), "bool": (bool,)}
+    kinds: Mapping[str, tuple[type, ...]] = {
+        "int": (int,),
+        "float": (int, float),
+        "str": (str,),
+        "bool": (bool,),
+    }
     declared = str(next(f.type for f in fields(kind) if f.name == name))
     allowed = tuple(k for word, types in kinds.items() if word in declared for k in types)
     if value is None and "None" in declared:
         return None
     if isinstance(value, float) and not math.isfinite(value):
         raise InputError(f"--{name.replace('_', '-')} {value}: is not a number")
-    if allowed and (not isinstance(value, allowed) or (isinstance(value, bool) and bool not in allowed)):
+    if allowed and (
+        not isinstance(value, allowed) or (isinstance(value, bool) and bool not in allowed)
+    ):
         raise InputError(f"--{name.replace('_', '-')} {value!r}: expected {declared}")
     return value
 
 
 def _levels(value: Any) -> tuple[int, ...]:
     """Tessellation levels of 3, "1,2,3" or a list."""
-    parts = value.split(",") if isinstance(value, str) else value if isinstance(value, (list, tuple)) else [value]
+    parts = (
+        value.split(",")
+        if isinstance(value, str)
+        else value
+        if isinstance(value, (list, tuple))
+        else [value]
+    )
     try:
         return tuple(dict.fromkeys(_whole(p) for p in parts))
     except (TypeError, ValueError, OverflowError):
-        raise InputError(f"--subdivision {value}: write one level or several, such as 3 or 1,2,3") from None
+        raise InputError(
+            f"--subdivision {value}: write one level or several, such as 3 or 1,2,3"
+        ) from None
 
 
 def _whole(value: Any) -> int:

@@ -14,9 +14,10 @@ if TYPE_CHECKING:
 
 
 def digest(value: object) -> str:
-    """Hexadecimal SHA-256 of a value: numbers, text, bytes, None, paths, arrays, and tuples, lists, sets, dictionaries
-    and dataclasses of such values, of which every field counts. Equal values have equal hashes, in any process.
-    Raises TypeError for other kinds of values: nothing is left out in silence."""
+    """Hexadecimal SHA-256 of a value: numbers, text, bytes, None, paths, arrays, and tuples, lists,
+    sets, dictionaries and dataclasses of such values, of which every field counts. Equal values
+    have equal hashes, in any process. Raises TypeError for other kinds of values: nothing is left
+    out in silence."""
     known: dict[int, bytes] = {}  # by identity: what is shared is hashed once
 
     def hashed(x: object) -> bytes:
@@ -47,7 +48,9 @@ def digest(value: object) -> str:
         elif isinstance(x, PurePath):
             yield str(x).encode(errors="surrogateescape")
         else:
-            raise TypeError(f"a {type(x).__name__} has no hash; say in digest.py what it consists of")
+            raise TypeError(
+                f"a {type(x).__name__} has no hash; say in digest.py what it consists of"
+            )
 
     return hashed(value).hex()
 

@@ -11,7 +11,9 @@ from appearance_opt.errors import BackendError
 
 def diagnose() -> dict[str, object]:
     """Facts by name; ``problem`` is empty, or says what to install."""
-    facts: dict[str, object] = {"system": f"{platform.system()} {platform.release()} {platform.machine()}"}
+    facts: dict[str, object] = {
+        "system": f"{platform.system()} {platform.release()} {platform.machine()}"
+    }
     facts["cores"] = backend.cores()
     facts["memory"] = _memory()
     facts.update(backend.versions())
@@ -21,14 +23,17 @@ def diagnose() -> dict[str, object]:
             backend=found.variant,
             llvm=found.llvm or "not used",
             threads=found.threads,
-            thread_limit=os.environ.get(backend.THREADS, "").strip() or f"none ({backend.THREADS} sets one)",
+            thread_limit=os.environ.get(backend.THREADS, "").strip()
+            or f"none ({backend.THREADS} sets one)",
             cuda="found" if found.cuda else "not found (optional)",
             problem="",
         )
     except BackendError as error:
         facts.update(backend="none", problem=str(error))
     except ImportError as error:
-        facts.update(backend="none", problem=f"{error}: reinstall with 'pip install appearance-opt'")
+        facts.update(
+            backend="none", problem=f"{error}: reinstall with 'pip install appearance-opt'"
+        )
     return facts
 
 

@@ -1,11 +1,15 @@
-"""The exceptions a user can meet. The command line prints their message as one line, exit code 2."""
+"""The exceptions a user can meet. The command line prints their message as one line, exit code
+2."""
 
 
 def one_line(text: str) -> str:
-    """``text`` on one line that is safe to print: control characters, marks that turn the direction of writing and lone
-    surrogates, which names in files may hold, become escapes such as ``\\x1b``."""
+    """``text`` on one line that is safe to print: control characters, marks that turn the direction
+    of writing and lone surrogates, which names in files may hold, become escapes such as
+    ``\\x1b``."""
     line = " ".join(text.split())
-    return line if line.isprintable() else "".join(c if c.isprintable() else _escape(c) for c in line)
+    return (
+        line if line.isprintable() else "".join(c if c.isprintable() else _escape(c) for c in line)
+    )
 
 
 def _escape(character: str) -> str:
@@ -17,11 +21,14 @@ LONGEST = 1000
 
 
 class AppearanceError(Exception):
-    """Base of every error that this package raises on purpose. Its message is one line of printable text."""
+    """Base of every error that this package raises on purpose. Its message is one line of printable
+    text."""
 
     def __init__(self, message: str = "") -> None:
         line = one_line(message)
-        super().__init__(line if len(line) <= LONGEST else f"{line[: LONGEST - 203]} ... {line[-198:]}")
+        super().__init__(
+            line if len(line) <= LONGEST else f"{line[: LONGEST - 203]} ... {line[-198:]}"
+        )
 
 
 class InputError(AppearanceError):

@@ -1,4 +1,5 @@
-"""What Ctrl-C does to a job: before there is anything to lose it ends the job, then it ends the fit alone."""
+"""What Ctrl-C does to a job: before there is anything to lose it ends the job, then it ends the fit
+alone."""
 
 from __future__ import annotations
 
@@ -18,9 +19,10 @@ LAST = 3
 class Interrupts:
     """A context in which interrupts (Ctrl-C; SIGTERM where it is handled alike) are taken by a job.
 
-    At first they raise KeyboardInterrupt, as ever. Between ``protect`` and ``release`` the first one only asks the fit
-    to end (``asked``), the second one warns, and the third one raises KeyboardInterrupt. In threads other than the main
-    one, and where a program has a handler of its own, nothing changes.
+    At first they raise KeyboardInterrupt, as ever. Between ``protect`` and ``release`` the first
+    one only asks the fit to end (``asked``), the second one warns, and the third one raises
+    KeyboardInterrupt. In threads other than the main one, and where a program has a handler of its
+    own, nothing changes.
     """
 
     def __init__(self) -> None:
@@ -36,7 +38,10 @@ class Interrupts:
         return self
 
     def __exit__(
-        self, kind: type[BaseException] | None, value: BaseException | None, traceback: TracebackType | None
+        self,
+        kind: type[BaseException] | None,
+        value: BaseException | None,
+        traceback: TracebackType | None,
     ) -> None:
         for number, handler in self._before.items():
             signal.signal(number, handler)  # type: ignore[arg-type]
@@ -67,6 +72,7 @@ class Interrupts:
 
 
 def _say(text: str) -> None:
-    """To standard error, without its buffer, in the middle of whose use the handler may be called."""
+    """To standard error, without its buffer, in the middle of whose use the handler may be
+    called."""
     with suppress(OSError):  # nobody listens
         os.write(2, f"WARNING: {text}\n".encode())

@@ -29,12 +29,13 @@ def lock_path(target: Path) -> Path:
 
 @contextmanager
 def locked(target: Path, *, folder: bool = False) -> Iterator[None]:
-    """Hold ``target``, a file or a ``folder``, for this process. Raises InputError naming the other process when
-    another one holds it.
+    """Hold ``target``, a file or a ``folder``, for this process. Raises InputError naming the other
+    process when another one holds it.
 
-    A file beside it, or in the folder, names process and host. What holds is an advisory lock on that file (flock),
-    which the system drops when the process ends, however it ends: the file that a killed run leaves behind holds
-    nothing. Folders that are made for it are removed at the end if nothing else came into them.
+    A file beside it, or in the folder, names process and host. What holds is an advisory lock on
+    that file (flock), which the system drops when the process ends, however it ends: the file that
+    a killed run leaves behind holds nothing. Folders that are made for it are removed at the end if
+    nothing else came into them.
     """
     path = target / FOLDER_LOCK if folder else lock_path(target)
     made = [p for p in (path.parent, *path.parent.parents) if not p.exists()]
@@ -53,16 +54,21 @@ def locked(target: Path, *, folder: bool = False) -> Iterator[None]:
 
 
 def acquire(path: Path, target: Path) -> int:
-    """The handle of the lock file ``path`` of ``target``, which holds until it is closed. Raises InputError when
-    another process has it, or when the file is none of ours."""
+    """The handle of the lock file ``path`` of ``target``, which holds until it is closed. Raises
+    InputError when another process has it, or when the file is none of ours."""
     while True:
         handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)
         try:
             found = os.read(handle, 512)
             if found and not found.startswith(PREFIX):
-                raise InputError(f"{path}: this name is needed for a lock, and the file is none; rename it")
+                raise InputError(
+                    f"{path}: this name is needed for a lock, and the file is none; rename it"
+                )
             if not _taken(handle, found):
-                who = found.removeprefix(b"appearance-opt: ").decode(errors="replace").strip() or "another process"
+                who = (
+                    found.removeprefix(b"appearance-opt: ").decode(errors="replace").strip()
+                    or "another process"
+                )
                 raise InputError(
                     f"{target}: another run is writing it ({who}); wait for it to end, or choose another name "
                     f"(the lock is {path})"
@@ -70,7 +76,9 @@ def acquire(path: Path, target: Path) -> int:
             if _same(handle, path):
                 with suppress(OSError):  # on a full disk it holds without a word
                     os.ftruncate(handle, 0)
-                    os.pwrite(handle, PREFIX + f"{os.getpid()} on {socket.gethostname()}\n".encode(), 0)
+                    os.pwrite(
+                        handle, PREFIX + f"{os.getpid()} on {socket.gethostname()}\n".encode(), 0
+                    )
                 return handle
         except BaseException:
             os.close(handle)

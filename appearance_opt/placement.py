@@ -1,7 +1,8 @@
 """Where a job's own coordinates lie in the world.
 
-A fit works on an object of radius 1 around the origin, so that no threshold in it and no digit of a float depends on
-the scale and place of the input. This is the one place that knows the way there and back.
+A fit works on an object of radius 1 around the origin, so that no threshold in it and no digit of a
+float depends on the scale and place of the input. This is the one place that knows the way there
+and back.
 """
 
 from __future__ import annotations
@@ -21,15 +22,16 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Placement:
-    """World = centre + scale * local, in double precision. ``centre`` in the world, ``scale``: metres per unit."""
+    """World = centre + scale * local, in double precision. ``centre`` in the world, ``scale``:
+    metres per unit."""
 
     centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
     scale: float = 1.0
 
     @classmethod
     def around(cls, points: NDArray) -> Placement:
-        """The local origin in the middle of the axis-aligned box around ``points`` (N, 3), and as its unit the radius
-        of the sphere around it that holds them all."""
+        """The local origin in the middle of the axis-aligned box around ``points`` (N, 3), and as
+        its unit the radius of the sphere around it that holds them all."""
         points = np.asarray(points, np.float64)
         centre = (points.min(axis=0) + points.max(axis=0)) / 2
         radius = float(np.sqrt(np.max(np.sum((points - centre) ** 2, axis=1))))
@@ -46,7 +48,10 @@ class Placement:
     def local(self, asset: Asset) -> Asset:
         """The asset in local coordinates; it has no origin of its own then."""
         relative = self.relative_to(asset.origin)
-        moved = (replace(m, positions=relative.to_local(m.positions).astype(np.float32)) for m in asset.meshes)
+        moved = (
+            replace(m, positions=relative.to_local(m.positions).astype(np.float32))
+            for m in asset.meshes
+        )
         return replace(asset, meshes=tuple(moved), origin=ZERO)
 
     def relative_to(self, origin: tuple[float, float, float]) -> Placement:

@@ -14,13 +14,13 @@ if TYPE_CHECKING:
 
 
 EVERY = 5.0
-"""Seconds between lines where there is no terminal for a bar, and before the first: what is over sooner, or refused,
-prints none."""
+"""Seconds between lines where there is no terminal for a bar, and before the first: what is over
+sooner, or refused, prints none."""
 
 
 class TerminalProgress:
-    """Shows what is being done, and during a fit step, loss, held-out PSNR, steps per second and time left. A context
-    manager."""
+    """Shows what is being done, and during a fit step, loss, held-out PSNR, steps per second and
+    time left. A context manager."""
 
     def __init__(self) -> None:
         self._bar: Progress | None = None
@@ -32,14 +32,21 @@ class TerminalProgress:
             from rich.console import Console
             from rich.progress import BarColumn, Progress, TextColumn
 
-            columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[info]}"))
+            columns = (
+                TextColumn("{task.description}"),
+                BarColumn(),
+                TextColumn("{task.fields[info]}"),
+            )
             self._bar = Progress(*columns, console=Console(stderr=True), transient=True)
             self._bar.start()
             self._task = self._bar.add_task("preparing", total=1.0, info="")
         return self
 
     def __exit__(
-        self, kind: type[BaseException] | None, value: BaseException | None, traceback: TracebackType | None
+        self,
+        kind: type[BaseException] | None,
+        value: BaseException | None,
+        traceback: TracebackType | None,
     ) -> None:
         self._forget()
         if self._bar is not None:
@@ -60,7 +67,13 @@ class TerminalProgress:
             self._next.start()
 
     def update(
-        self, step: int, fraction: float, loss: float, psnr: float, steps_per_second: float, seconds_left: float | None
+        self,
+        step: int,
+        fraction: float,
+        loss: float,
+        psnr: float,
+        steps_per_second: float,
+        seconds_left: float | None,
     ) -> None:
         """See ``fit.loop.Progress``."""
         left = "" if seconds_left is None else f"  {seconds_left:.0f} s left"

@@ -1,4 +1,5 @@
-"""Files that appear together: written under temporary names, and renamed once all of them are whole."""
+"""Files that appear together: written under temporary names, and renamed once all of them are
+whole."""
 
 from __future__ import annotations
 
@@ -21,17 +22,18 @@ PREFIX = ".appearance-opt-"
 """How the names of the folders begin in which files wait for their final names."""
 
 NEW, OLD, JOURNAL, LOCK = "new", "old", "journal.json", "lock"
-"""What lies in such a folder: what is written; what it replaces, while it does; which names are being changed; and a
-lock that holds as long as the process lives."""
+"""What lies in such a folder: what is written; what it replaces, while it does; which names are
+being changed; and a lock that holds as long as the process lives."""
 
 
 class Publication:
     """Files that get their final names together or not at all. Made by ``publication``.
 
-    A single file is renamed at once. Of several, the old ones move aside first, those that refer to others before all
-    others, and then the new ones take their names in the opposite order: at no moment does a file refer to parts of
-    another version. A journal beside them says what is being done. When a rename fails all is undone; when the process
-    is killed in between, ``recover`` undoes it before the next run writes there.
+    A single file is renamed at once. Of several, the old ones move aside first, those that refer to
+    others before all others, and then the new ones take their names in the opposite order: at no
+    moment does a file refer to parts of another version. A journal beside them says what is being
+    done. When a rename fails all is undone; when the process is killed in between, ``recover``
+    undoes it before the next run writes there.
     """
 
     def __init__(self) -> None:
@@ -39,8 +41,8 @@ class Publication:
         self._roots: list[Path] = []
 
     def place(self, final: Path) -> Path:
-        """Where to write ``final``. What is written beside it, or in folders there, appears beside ``final``, and
-        before it."""
+        """Where to write ``final``. What is written beside it, or in folders there, appears beside
+        ``final``, and before it."""
         final = Path(final)
         self._roots.append(final)
         folder = final.parent.resolve()
@@ -57,7 +59,9 @@ class Publication:
         moves.sort(key=lambda move: (move[1] in roots, str(move[1])))
         for new, final in moves:
             if final.is_dir():
-                raise InputError(f"{final}: is a folder, where a file is to be written; choose another name")
+                raise InputError(
+                    f"{final}: is a folder, where a file is to be written; choose another name"
+                )
             _synchronize(new)
         if len(moves) == 1:
             moves[0][0].replace(moves[0][1])
@@ -68,7 +72,9 @@ class Publication:
 
     def _replace(self, moves: list[tuple[Path, Path]]) -> None:
         for staged in self._staged.values():
-            staged.write_journal([str(n.relative_to(staged.new)) for n, _ in moves if n.is_relative_to(staged.new)])
+            staged.write_journal(
+                [str(n.relative_to(staged.new)) for n, _ in moves if n.is_relative_to(staged.new)]
+            )
         try:
             for new, final in reversed(moves):
                 final.parent.mkdir(parents=True, exist_ok=True)
@@ -94,7 +100,8 @@ class Publication:
             staged.close()
 
     def named(self, path: object) -> str | None:
-        """The final name of a file that waits here, the first of all where none is named; None for other files."""
+        """The final name of a file that waits here, the first of all where none is named; None for
+        other files."""
         if not isinstance(path, str):
             return str(self._roots[0]) if self._roots else None
         for staged in self._staged.values():
@@ -106,8 +113,8 @@ class Publication:
 
 @contextmanager
 def publication() -> Iterator[Publication]:
-    """Files written to places of the publication appear at the end, all or none; none of them if the block raises.
-    Raises OSError naming the file that could not be written by its final name."""
+    """Files written to places of the publication appear at the end, all or none; none of them if
+    the block raises. Raises OSError naming the file that could not be written by its final name."""
     together = Publication()
     try:
         yield together
@@ -129,8 +136,8 @@ def publishing(final: Path) -> Iterator[Path]:
 
 
 def recover(folder: Path) -> None:
-    """Undo what a killed run has left half done in ``folder``, and remove its temporary files. What belongs to a
-    process that lives is left alone."""
+    """Undo what a killed run has left half done in ``folder``, and remove its temporary files. What
+    belongs to a process that lives is left alone."""
     for root in sorted(folder.glob(PREFIX + "*")):
         if not root.is_dir() or root.is_symlink() or not (root / LOCK).is_file():
             continue
@@ -161,25 +168,36 @@ class _Staged:
 
     def moves(self) -> list[tuple[Path, Path]]:
         """(where it waits, final name) of every file."""
-        return [(p, self.folder / p.relative_to(self.new)) for p in sorted(self.new.rglob("*")) if p.is_file()]
+        return [
+            (p, self.folder / p.relative_to(self.new))
+            for p in sorted(self.new.rglob("*"))
+            if p.is_file()
+        ]
 
     def old_of(self, new: Path) -> Path:
         """Where the file goes that ``new`` replaces."""
         return self.old / new.relative_to(self.new)
 
     def write_journal(self, names: list[str]) -> None:
-        """Note which names are about to change, those that refer to others last, and which files are new."""
+        """Note which names are about to change, those that refer to others last, and which files
+        are new."""
         self.journal.write_text(json.dumps([[name, *_identity(self.new / name)] for name in names]))
         _synchronize(self.journal)
 
     def undo(self) -> None:
-        """Back to what was there before: new files go, old ones return. May be cut short and done again.
+        """Back to what was there before: new files go, old ones return. May be cut short and done
+        again.
 
-        A journal may come from anybody who packs a folder, so it is not trusted: only files that are known by their
-        number on this disk go, nothing is replaced, and no name leads out of the folder."""
+        A journal may come from anybody who packs a folder, so it is not trusted: only files that
+        are known by their number on this disk go, nothing is replaced, and no name leads out of the
+        folder."""
         for name, device, number in reversed(self._noted()):
             new, final = self.new / name, self.folder / name
-            if not os.path.lexists(new) and os.path.lexists(final) and _identity(final) == (device, number):
+            if (
+                not os.path.lexists(new)
+                and os.path.lexists(final)
+                and _identity(final) == (device, number)
+            ):
                 final.rename(new)
         for name, _, _ in self._noted():
             if os.path.lexists(self.old / name) and not os.path.lexists(self.folder / name):
@@ -190,7 +208,8 @@ class _Staged:
         """(name, device, number) of the journal, as far as it is one."""
         try:
             rows = [
-                (str(name), int(device), int(number)) for name, device, number in json.loads(self.journal.read_text())
+                (str(name), int(device), int(number))
+                for name, device, number in json.loads(self.journal.read_text())
             ]
         except (OSError, ValueError, TypeError):
             return []  # nothing was begun

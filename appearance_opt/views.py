@@ -14,24 +14,24 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 RECORD = 16
-"""Floats per view on the device: eye, forward, right, down, each xyz and one number of the light: its position and its
-intensity."""
+"""Floats per view on the device: eye, forward, right, down, each xyz and one number of the light:
+its position and its intensity."""
 
 FIT, VALIDATION, VISIBILITY, START, MEASURED = range(5)
-"""Streams of views, which share none: those that a fit draws, those by which it keeps its best state, those that tell
-what of the reference is seen, those by which a start is chosen, and those of reports and comparisons, which nothing
-was ever chosen by."""
+"""Streams of views, which share none: those that a fit draws, those by which it keeps its best
+state, those that tell what of the reference is seen, those by which a start is chosen, and those of
+reports and comparisons, which nothing was ever chosen by."""
 
 
 @dataclass(frozen=True)
 class Views:
     """B perspective cameras, each with one point light.
 
-    ``eye``, ``forward``, ``right``, ``down``: (B, 3) float32. ``forward`` is a unit vector; ``right``
-    and ``down`` span the image plane at distance 1, scaled by the tangent of half the field of view:
-    the ray through image coordinates (x, y) in [-1, 1]^2, y down, is forward + x right + y down.
-    ``light``: (B, 3) position; ``intensity``: (B,) radiant intensity, the same for R, G and B.
-    Images are square.
+    ``eye``, ``forward``, ``right``, ``down``: (B, 3) float32. ``forward`` is a unit vector;
+    ``right`` and ``down`` span the image plane at distance 1, scaled by the tangent of half the
+    field of view: the ray through image coordinates (x, y) in [-1, 1]^2, y down, is forward + x
+    right + y down. ``light``: (B, 3) position; ``intensity``: (B,) radiant intensity, the same for
+    R, G and B. Images are square.
     """
 
     eye: NDArray[np.float32]
@@ -50,7 +50,9 @@ class Views:
     @staticmethod
     def concatenate(parts: list[Views]) -> Views:
         """Several batches as one."""
-        return Views(*(np.concatenate([getattr(p, f) for p in parts]) for f in Views.__dataclass_fields__))
+        return Views(
+            *(np.concatenate([getattr(p, f) for p in parts]) for f in Views.__dataclass_fields__)
+        )
 
     def records(self) -> mi.Float:
         """Upload: B records of ``RECORD`` floats."""
@@ -75,8 +77,8 @@ def look_at(
     intensity: NDArray | float,
     up: NDArray | None = None,
 ) -> Views:
-    """Cameras at ``eye`` (B, 3) that look at ``target`` (B, 3) or (3,), with a field of view of ``fov``
-    degrees (full angle, width = height; one number or (B,)), lights at ``light`` (B, 3)."""
+    """Cameras at ``eye`` (B, 3) that look at ``target`` (B, 3) or (3,), with a field of view of
+    ``fov`` degrees (full angle, width = height; one number or (B,)), lights at ``light`` (B, 3)."""
     eye = np.atleast_2d(np.asarray(eye, np.float64))
     forward = np.asarray(target, np.float64) - eye
     forward /= np.linalg.norm(forward, axis=1, keepdims=True)
@@ -88,7 +90,14 @@ def look_at(
     right /= np.linalg.norm(right, axis=1, keepdims=True)
     down = np.cross(forward, right)
     scale = np.tan(np.radians(np.broadcast_to(fov, len(eye))) / 2)[:, None]
-    arrays = (eye, forward, right * scale, down * scale, light, np.broadcast_to(intensity, len(eye)))
+    arrays = (
+        eye,
+        forward,
+        right * scale,
+        down * scale,
+        light,
+        np.broadcast_to(intensity, len(eye)),
+    )
     return Views(*(np.ascontiguousarray(a, np.float32) for a in arrays))
 
 
@@ -96,11 +105,11 @@ def look_at(
 class ViewSampler:
     """Random cameras on a sphere around the object, each with one random point light.
 
-    Roll is random. Each view is framed by itself: the extreme points ``hull`` (N, 3) of the object, or its
-    bounding sphere when they are not known, just fill the image. The light's direction is uniform within
-    a cone around the direction to the camera (``light_spread`` degrees, 180 = anywhere), or it sits at
-    the camera (``headlight``). Its intensity makes a white diffuse surface at the centre that faces it
-    reflect ``exposure``.
+    Roll is random. Each view is framed by itself: the extreme points ``hull`` (N, 3) of the object,
+    or its bounding sphere when they are not known, just fill the image. The light's direction is
+    uniform within a cone around the direction to the camera (``light_spread`` degrees, 180 =
+    anywhere), or it sits at the camera (``headlight``). Its intensity makes a white diffuse surface
+    at the centre that faces it reflect ``exposure``.
 
     Views are a pure function of (seed, stream, iteration): any iteration can be replayed, and a
     resumed fit goes on with the same sequence.
@@ -134,7 +143,14 @@ class ViewSampler:
             toward_light = direction * cosine + side * np.sqrt(np.maximum(0.0, 1 - cosine**2))
         lamp = distance if self.light == "headlight" else 4 * self.radius
         intensity = np.pi * self.exposure * lamp**2
-        views = look_at(centre + direction * distance, centre, self.fov, centre + toward_light * lamp, intensity, spin)
+        views = look_at(
+            centre + direction * distance,
+            centre,
+            self.fov,
+            centre + toward_light * lamp,
+            intensity,
+            spin,
+        )
         return views if self.hull is None else _framed(views, self.hull)
 
 
@@ -143,17 +159,25 @@ MARGIN = 1.02
 
 
 def _framed(views: Views, points: NDArray) -> Views:
-    """The same eyes and lights, turned and zoomed so that ``points`` (N, 3) just fill each image."""
+    """The same eyes and lights, turned and zoomed so that ``points`` (N, 3) just fill each
+    image."""
     scale = np.linalg.norm(views.right, axis=1, keepdims=True)
     v = points[None] - views.eye[:, None]
     depth = np.einsum("bnk,bk->bn", v, views.forward)
     x = np.einsum("bnk,bk->bn", v, views.right / scale) / depth
     y = np.einsum("bnk,bk->bn", v, views.down / scale) / depth
     middle_x, middle_y = ((a.min(axis=1) + a.max(axis=1)) / 2 for a in (x, y))
-    target = views.eye + views.forward + (views.right * middle_x[:, None] + views.down * middle_y[:, None]) / scale
+    target = (
+        views.eye
+        + views.forward
+        + (views.right * middle_x[:, None] + views.down * middle_y[:, None]) / scale
+    )
     turned = look_at(views.eye, target, 90.0, views.light, views.intensity, -views.down)
     depth = np.einsum("bnk,bk->bn", v, turned.forward)
-    reach = [np.abs(np.einsum("bnk,bk->bn", v, a) / depth).max(axis=1) for a in (turned.right, turned.down)]
+    reach = [
+        np.abs(np.einsum("bnk,bk->bn", v, a) / depth).max(axis=1)
+        for a in (turned.right, turned.down)
+    ]
     half = MARGIN * np.maximum(*reach)[:, None]
     arrays = (turned.right * half, turned.down * half)
     return replace(turned, right=arrays[0].astype(np.float32), down=arrays[1].astype(np.float32))
@@ -161,20 +185,26 @@ def _framed(views: Views, points: NDArray) -> Views:
 
 def views_around(points: NDArray, seed: int, light: str = "point") -> ViewSampler:
     """Views of an object of radius 1 around the origin, framed to its ``points`` (N, 3)."""
-    return ViewSampler((0.0, 0.0, 0.0), 1.0, seed, hull=support(np.asarray(points, np.float32)), light=light)
+    return ViewSampler(
+        (0.0, 0.0, 0.0), 1.0, seed, hull=support(np.asarray(points, np.float32)), light=light
+    )
 
 
 SUPPORT_POINTS = 1 << 18
-"""Points of a cloud that are looked at in every direction. Of larger clouds these are taken evenly, and the extreme
-ones along axes and diagonals, so that what sticks out is not cut off."""
+"""Points of a cloud that are looked at in every direction. Of larger clouds these are taken evenly,
+and the extreme ones along axes and diagonals, so that what sticks out is not cut off."""
 
 
 def support(positions: NDArray, count: int = 256) -> NDArray[np.float64]:
     """Extreme points of a cloud in ``count`` directions: enough to frame it from any side."""
     if len(positions) > SUPPORT_POINTS:
-        axes = np.stack(np.meshgrid(*[[-1, 0, 1]] * 3), axis=-1).reshape(-1, 3).astype(positions.dtype)
+        axes = (
+            np.stack(np.meshgrid(*[[-1, 0, 1]] * 3), axis=-1).reshape(-1, 3).astype(positions.dtype)
+        )
         far = np.unique([np.argmax(positions @ axis) for axis in axes])
-        positions = np.concatenate([positions[:: -(-len(positions) // SUPPORT_POINTS)], positions[far]])
+        positions = np.concatenate(
+            [positions[:: -(-len(positions) // SUPPORT_POINTS)], positions[far]]
+        )
     k = np.arange(count) + 0.5
     polar, azimuth = np.arccos(1 - 2 * k / count), np.pi * (1 + 5**0.5) * k
     directions = np.stack(

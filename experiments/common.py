@@ -1,4 +1,5 @@
-"""What experiments share: their assets, the neutral renderer, frames, and results that are kept row by row."""
+"""What experiments share: their assets, the neutral renderer, frames, and results that are kept row
+by row."""
 
 from __future__ import annotations
 
@@ -24,7 +25,8 @@ OUT = ROOT / "out"
 
 
 class Missing(SystemExit):
-    """A file that an experiment needs is not there: ends the program with one line, unless it is caught."""
+    """A file that an experiment needs is not there: ends the program with one line, unless it is
+    caught."""
 
 
 def asset(name: str) -> Path:
@@ -33,13 +35,16 @@ def asset(name: str) -> Path:
 
 
 def source_of(name: str) -> Path:
-    """The heavy GLB of that name; the embedded scene is built when it is first asked for. Raises Missing."""
+    """The heavy GLB of that name; the embedded scene is built when it is first asked for. Raises
+    Missing."""
     if name != "relic":
         return _there(JUDGE / "references" / f"{name}.glb")
     path = OUT / "scenes" / f"{name}.glb"
     if not path.exists():
         path.parent.mkdir(parents=True, exist_ok=True)
-        subprocess.run([sys.executable, "-m", "scenes.build", name, str(path)], check=True, cwd=ROOT)
+        subprocess.run(
+            [sys.executable, "-m", "scenes.build", name, str(path)], check=True, cwd=ROOT
+        )
     return path
 
 
@@ -63,19 +68,25 @@ def judge(
     seed: int = 1234,
     pictures: Path | None = None,
 ) -> dict[str, dict]:
-    """Scores of the neutral renderer by candidate (a GLB by name), also written to ``<stem>.judge.json``. ``seed``: of
-    the views. ``pictures``: a folder for what was seen."""
+    """Scores of the neutral renderer by candidate (a GLB by name), also written to
+    ``<stem>.judge.json``. ``seed``: of the views. ``pictures``: a folder for what was seen."""
     scores = Path(f"{stem}.judge.json")
     options = ["--views", str(views), "--spp", "36", "--seed", str(seed), "--json", str(scores)]
     options += [] if pictures is None else ["--dump", str(pictures)]
-    command = [sys.executable, str(JUDGE / "evaluate.py"), str(source), *candidates.values(), *options]
+    command = [
+        sys.executable,
+        str(JUDGE / "evaluate.py"),
+        str(source),
+        *candidates.values(),
+        *options,
+    ]
     _output_of(command, JUDGE)
     return dict(zip(candidates, json.loads(scores.read_text())["candidates"], strict=True))
 
 
 class Placed:
-    """An asset placed for a fit, as a job sees it: ``asset`` in local coordinates, its ``placement``, its
-    ``reference`` and the ``sampler`` of its views."""
+    """An asset placed for a fit, as a job sees it: ``asset`` in local coordinates, its
+    ``placement``, its ``reference`` and the ``sampler`` of its views."""
 
     def __init__(self, asset: Asset, seed: int = 0) -> None:
         from appearance_opt.jobs.parts import split
@@ -91,7 +102,8 @@ class Placed:
 
 
 class Kept:
-    """Rows of a JSON file: one that is there with the same key is not run again, each new one is written at once."""
+    """Rows of a JSON file: one that is there with the same key is not run again, each new one is
+    written at once."""
 
     def __init__(self, path: Path) -> None:
         self.path = path

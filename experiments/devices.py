@@ -3,8 +3,9 @@
     python -m experiments.devices --device cpu --write FILE.npz      # on one machine
     python -m experiments.devices --device cuda --compare FILE.npz   # on the other, or on the same
 
-Prints a Markdown table for docs/accuracy.md: the PSNR between the two devices' reference images, and relative L2
-error and cosine of every gradient of one step, on the scene of ``experiments.bench``.
+Prints a Markdown table for docs/accuracy.md: the PSNR between the two devices' reference images,
+and relative L2 error and cosine of every gradient of one step, on the scene of
+``experiments.bench``.
 """
 
 from __future__ import annotations
@@ -21,7 +22,9 @@ VIEWS, RESOLUTION, TRIANGLES, REFERENCE, MAPS = 4, 256, 3000, 100_000, 512
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--device", required=True, choices=("cpu", "cuda"))
     what = parser.add_mutually_exclusive_group(required=True)
     what.add_argument("--write", type=Path)
@@ -67,7 +70,11 @@ def table(pairs: dict[str, tuple[NDArray, NDArray]]) -> str:
         error = np.linalg.norm(a - b) / np.linalg.norm(a)
         cosine = a @ b / (np.linalg.norm(a) * np.linalg.norm(b))
         # linear values; whatever is whiter than white counts as white
-        shown = -10 * np.log10(max(np.mean((a.clip(0, 1) - b.clip(0, 1)) ** 2), 1e-20)) if "image" in name else None
+        shown = (
+            -10 * np.log10(max(np.mean((a.clip(0, 1) - b.clip(0, 1)) ** 2), 1e-20))
+            if "image" in name
+            else None
+        )
         psnr = "" if shown is None else f"{shown:.1f} dB"
         lines.append(f"| {name} | {psnr} | {error:.1e} | {cosine:.6f} |")
     return "\n".join(lines)

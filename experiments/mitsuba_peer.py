@@ -1,4 +1,5 @@
-"""The same surface, light and camera in Mitsuba's own terms, for comparisons with its integrators."""
+"""The same surface, light and camera in Mitsuba's own terms, for comparisons with its
+integrators."""
 
 from __future__ import annotations
 
@@ -19,10 +20,11 @@ BSDF_NAME = "appearance_opt_brdf"
 
 
 def register() -> None:
-    """Make our BRDF known to Mitsuba under ``BSDF_NAME``: textures ``base_color``, ``roughness``, ``metalness``.
+    """Make our BRDF known to Mitsuba under ``BSDF_NAME``: textures ``base_color``, ``roughness``,
+    ``metalness``.
 
-    It is evaluated for a given light and never sampled: under point lights there is nothing to sample, and
-    an emitting backdrop lights nothing.
+    It is evaluated for a given light and never sampled: under point lights there is nothing to
+    sample, and an emitting backdrop lights nothing.
     """
 
     class Reflection(mi.BSDF):  # type: ignore[misc, valid-type]
@@ -63,15 +65,23 @@ def register() -> None:
     mi.register_bsdf(BSDF_NAME, Reflection)
 
 
-def mesh(name: str, positions: NDArray, faces: NDArray, bsdf: Any, **attributes: NDArray) -> mi.Mesh:
-    """Mitsuba mesh with smooth (angle-weighted) normals. ``attributes``: ``normals`` (V, 3) and ``uvs`` (V, 2) if
-    given, and any per-vertex attribute by its Mitsuba name, e.g. ``vertex_color`` (V, 3)."""
+def mesh(
+    name: str, positions: NDArray, faces: NDArray, bsdf: Any, **attributes: NDArray
+) -> mi.Mesh:
+    """Mitsuba mesh with smooth (angle-weighted) normals. ``attributes``: ``normals`` (V, 3) and
+    ``uvs`` (V, 2) if given, and any per-vertex attribute by its Mitsuba name, e.g. ``vertex_color``
+    (V, 3)."""
     props = mi.Properties()
     props["bsdf"] = mi.load_dict(bsdf) if isinstance(bsdf, dict) else bsdf
     uvs = attributes.pop("uvs", None)
     normals = attributes.pop("normals", None)
     out = mi.Mesh(
-        name, len(positions), len(faces), props=props, has_vertex_normals=True, has_vertex_texcoords=uvs is not None
+        name,
+        len(positions),
+        len(faces),
+        props=props,
+        has_vertex_normals=True,
+        has_vertex_texcoords=uvs is not None,
     )
     for key, value in attributes.items():
         out.add_attribute(key, value.shape[1], np.ascontiguousarray(value, np.float32).ravel())
@@ -89,7 +99,9 @@ def mesh(name: str, positions: NDArray, faces: NDArray, bsdf: Any, **attributes:
 
 def sensor(views: Views, k: int, resolution: int) -> mi.Sensor:
     """Camera ``k`` of the views, with a box filter."""
-    eye, forward, down = (np.asarray(a[k], np.float64) for a in (views.eye, views.forward, views.down))
+    eye, forward, down = (
+        np.asarray(a[k], np.float64) for a in (views.eye, views.forward, views.down)
+    )
     half = float(np.linalg.norm(views.right[k]))
     film = {
         "type": "hdrfilm",
@@ -122,15 +134,24 @@ def light(views: Views, k: int) -> dict:
     }
 
 
-def backdrop(views: Views, k: int, color: tuple[float, float, float], distance: float = 50.0) -> dict:
-    """A wall of the given radiance behind everything that view ``k`` sees; it is never sampled as a light."""
+def backdrop(
+    views: Views, k: int, color: tuple[float, float, float], distance: float = 50.0
+) -> dict:
+    """A wall of the given radiance behind everything that view ``k`` sees; it is never sampled as a
+    light."""
     eye, forward = (np.asarray(a[k], np.float64) for a in (views.eye, views.forward))
     centre = eye + forward * distance
     up = [0, 1, 0] if abs(forward[1]) < 0.9 else [1, 0, 0]
-    place = mi.ScalarTransform4f().look_at(list(centre), list(eye), up) @ mi.ScalarTransform4f().scale(2 * distance)
+    place = mi.ScalarTransform4f().look_at(
+        list(centre), list(eye), up
+    ) @ mi.ScalarTransform4f().scale(2 * distance)
     return {
         "type": "rectangle",
         "to_world": place,
-        "emitter": {"type": "area", "sampling_weight": 0.0, "radiance": {"type": "rgb", "value": list(color)}},
+        "emitter": {
+            "type": "area",
+            "sampling_weight": 0.0,
+            "radiance": {"type": "rgb", "value": list(color)},
+        },
         "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.0}},
     }

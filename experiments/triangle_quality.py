@@ -2,11 +2,12 @@
 
     python -m experiments.triangle_quality [--ratios 0.015 0.05 0.2] [--assets spot stacked ...]
 
-As in a start: what outside views see of each face is its importance, and nothing is fitted. "slivers": share of the
-triangles with a quality 4 sqrt(3) area / (sum of squared sides) below 0.1; the first one is the input's. "folded":
-triangles that look away (by more than 100 degrees) from each of at least two neighbours, in connected parts of more
-than 12: smaller ones are thin boxes and crossed cards. "stacked" is made here: a post whose flat underside has flaps of
-coincident triangles, as booleans leave them.
+As in a start: what outside views see of each face is its importance, and nothing is fitted.
+"slivers": share of the triangles with a quality 4 sqrt(3) area / (sum of squared sides) below 0.1;
+the first one is the input's. "folded": triangles that look away (by more than 100 degrees) from
+each of at least two neighbours, in connected parts of more than 12: smaller ones are thin boxes and
+crossed cards. "stacked" is made here: a post whose flat underside has flaps of coincident
+triangles, as booleans leave them.
 """
 
 from __future__ import annotations
@@ -41,26 +42,40 @@ FILES = {
 }
 RATIOS = (0.015, 0.05, 0.2)
 SLIVER, AWAY, SMALL, LEAST = 0.1, -0.17, 12, 40
-"""Quality of slivers, cosine of folds, triangles of parts that are not looked at for folds, and least budget."""
+"""Quality of slivers, cosine of folds, triangles of parts that are not looked at for folds, and
+least budget."""
 
 
 def stacked(segments: int = 120, rings: int = 60, fans: int = 40) -> Asset:
-    """A post, closed, with flaps on its underside: two triangles of opposite sense over the same corners, 1 to 9 such
-    pairs at an edge."""
+    """A post, closed, with flaps on its underside: two triangles of opposite sense over the same
+    corners, 1 to 9 such pairs at an edge."""
     from appearance_opt.asset.types import Asset, Material, Mesh
 
     rng = np.random.default_rng(0)
     turn = 2 * np.pi * np.arange(segments) / segments
-    radius = np.concatenate([np.linspace(0.02, 0.5, rings // 2), 0.35 + 0.15 * np.cos(np.linspace(0, 9, rings))])
+    radius = np.concatenate(
+        [np.linspace(0.02, 0.5, rings // 2), 0.35 + 0.15 * np.cos(np.linspace(0, 9, rings))]
+    )
     height = np.concatenate([np.zeros(rings // 2), np.linspace(0, 2, rings)])
     p = np.stack(
-        [np.outer(radius, np.cos(turn)), np.repeat(height[:, None], segments, 1), np.outer(radius, np.sin(turn))], -1
+        [
+            np.outer(radius, np.cos(turn)),
+            np.repeat(height[:, None], segments, 1),
+            np.outer(radius, np.sin(turn)),
+        ],
+        -1,
     )
     row = np.arange(p.size // 3).reshape(len(radius), segments)
     a, b = row[:-1], np.roll(row, -1, 1)[:-1]
     c, d = row[1:], np.roll(row, -1, 1)[1:]
-    ends = [[(r[0], r[i], r[i + 1]) for i in range(1, segments - 1)] for r in (row[0], row[-1][::-1])]
-    faces = [np.stack([a, b, d], -1).reshape(-1, 3), np.stack([a, d, c], -1).reshape(-1, 3), *map(np.array, ends)]
+    ends = [
+        [(r[0], r[i], r[i + 1]) for i in range(1, segments - 1)] for r in (row[0], row[-1][::-1])
+    ]
+    faces = [
+        np.stack([a, b, d], -1).reshape(-1, 3),
+        np.stack([a, d, c], -1).reshape(-1, 3),
+        *map(np.array, ends),
+    ]
     points, flaps = [*p.reshape(-1, 3)], []
     for _ in range(fans):
         ring, k = rng.integers(rings // 6, rings // 3), rng.integers(segments)
@@ -70,7 +85,9 @@ def stacked(segments: int = 120, rings: int = 60, fans: int = 40) -> Asset:
             points.append((points[i] + points[j]) / 2 + side * (0.3 + 0.02 * n))
             flaps += [(i, j, len(points) - 1), (j, i, len(points) - 1)]
     mesh = Mesh(
-        np.array(points, np.float32), np.concatenate([*faces, np.array(flaps)]).astype(np.int32), material=Material()
+        np.array(points, np.float32),
+        np.concatenate([*faces, np.array(flaps)]).astype(np.int32),
+        material=Material(),
     )
     return Asset((mesh,), "stacked")
 
@@ -81,7 +98,9 @@ def loaded(name: str) -> Asset:
 
     if name == "stacked":
         return stacked()
-    return load(source_of(name) if name == "relic" else asset(FILES[name]), missing_textures="ignore")
+    return load(
+        source_of(name) if name == "relic" else asset(FILES[name]), missing_textures="ignore"
+    )
 
 
 def shapes(p: NDArray, f: NDArray) -> tuple[float, int]:
@@ -124,7 +143,13 @@ def rows(name: str, ratios: list[float], decimate: Callable[..., tuple]) -> list
     for ratio in ratios:
         began = time.perf_counter()
         budget = max(round(ratio * count), LEAST)
-        p, f, *_ = decimate(merged.positions, merged.faces[seen], budget, weight[seen], placed.reference.single[seen])
+        p, f, *_ = decimate(
+            merged.positions,
+            merged.faces[seen],
+            budget,
+            weight[seen],
+            placed.reference.single[seen],
+        )
         seconds = time.perf_counter() - began
         slivers, folded = shapes(p, f)
         shares = f"{100 * before:.1f} | {100 * slivers:.1f} ({round(slivers * len(f))})"
@@ -136,15 +161,35 @@ def main() -> None:
     from appearance_opt import backend
     from appearance_opt.initial.decimate import decimate_with_source
 
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--ratios", type=float, nargs="+", default=list(RATIOS), help="shares of the triangles to keep")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--ratios",
+        type=float,
+        nargs="+",
+        default=list(RATIOS),
+        help="shares of the triangles to keep",
+    )
     names = ["stacked", *FILES, "relic"]
     parser.add_argument(
-        "--assets", nargs="+", choices=names, default=names, help=f"models of {Path(ASSETS).name}, made here, or both"
+        "--assets",
+        nargs="+",
+        choices=names,
+        default=names,
+        help=f"models of {Path(ASSETS).name}, made here, or both",
     )
     given = parser.parse_args()
     backend.select("cpu")
-    columns = ("asset", "triangles", "left", "slivers of the input (%)", "slivers (%)", "folded", "seconds")
+    columns = (
+        "asset",
+        "triangles",
+        "left",
+        "slivers of the input (%)",
+        "slivers (%)",
+        "folded",
+        "seconds",
+    )
     print(f"| {' | '.join(columns)} |\n|{'---|' * len(columns)}")
     for name in given.assets:
         try:

@@ -1,1 +1,2 @@
-"""Procedural scenes of this project: ``python -m scenes.build --list``. Nothing here is downloaded."""
+"""Procedural scenes of this project: ``python -m scenes.build --list``. Nothing here is
+downloaded."""

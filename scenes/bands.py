@@ -1,8 +1,9 @@
 """Sheets made of bands: what a band's ornament is, and how a sheet becomes relief and textures.
 
-A sheet is a (u, s) rectangle: u around, periodic; s along, from 0 to 1, split into bands. Its relief
-displaces the mesh; the same ornaments, sampled per texel, give base colour, roughness, metalness and
-the normal map. What the mesh resolves is in ``Relief.height``; what it does not is in ``Relief.micro``.
+A sheet is a (u, s) rectangle: u around, periodic; s along, from 0 to 1, split into bands. Its
+relief displaces the mesh; the same ornaments, sampled per texel, give base colour, roughness,
+metalness and the normal map. What the mesh resolves is in ``Relief.height``; what it does not is in
+``Relief.micro``.
 """
 
 from __future__ import annotations
@@ -33,7 +34,8 @@ class Substance:
 @dataclass(frozen=True)
 class Relief:
     """``height``: (len(t), len(u)) metres along the normal; ``micro``: the same, for the normal map
-    only; ``layers``: masks (len(t), len(u)) in [0, 1] with what they are made of, painted in order."""
+    only; ``layers``: masks (len(t), len(u)) in [0, 1] with what they are made of, painted in
+    order."""
 
     height: NDArray[np.float32]
     micro: NDArray[np.float32] | float = 0.0
@@ -83,7 +85,9 @@ class Sheet:
     def rows(self) -> NDArray:
         """Values of s of the mesh's rows: every band's own count, band edges included."""
         spans = zip(self.edges[:-1], self.edges[1:], self.bands, strict=True)
-        return np.concatenate([[0.0], *(np.linspace(a, b, band.rows + 1)[1:] for a, b, band in spans)])
+        return np.concatenate(
+            [[0.0], *(np.linspace(a, b, band.rows + 1)[1:] for a, b, band in spans)]
+        )
 
     def reliefs(self, u: NDArray, s: NDArray) -> list[tuple[Band, slice, Patch, Relief]]:
         """Every band with its rows of the grid and its relief there."""
@@ -106,12 +110,15 @@ class Sheet:
         for du, ds, radius, depth in self.dents:
             around = ((u - du + 0.5) % 1.0 - 0.5) * girth
             along = (s - ds) * length
-            total -= (depth * np.exp(-(along[:, None] ** 2 + around**2) / radius**2)).astype(np.float32)
+            total -= (depth * np.exp(-(along[:, None] ** 2 + around**2) / radius**2)).astype(
+                np.float32
+            )
         return total
 
 
 def paint(sheet: Sheet, width: int, height: int, name: str) -> Material:
-    """The sheet's material: base colour (sRGB), ORM and normal textures of height x width texels."""
+    """The sheet's material: base colour (sRGB), ORM and normal textures of height x width
+    texels."""
     u = (np.arange(width) + 0.5) / width
     s = 1 - (np.arange(height) + 0.5) / height  # v grows downward, s upward
     flip = slice(None, None, -1)
@@ -147,7 +154,15 @@ class _Canvas:
         empty[1][..., 0] = 1.0
         return _Canvas(*empty, *(np.zeros((height, width), np.float32) for _ in range(2)))
 
-    def draw(self, rows: slice, patch: Patch, relief: Relief, ground: Substance, noise: NDArray, seed: int) -> None:
+    def draw(
+        self,
+        rows: slice,
+        patch: Patch,
+        relief: Relief,
+        ground: Substance,
+        noise: NDArray,
+        seed: int,
+    ) -> None:
         """Ground and layers of one band."""
         full = np.ones(noise.shape, np.float32)
         for mask, substance in ((full, ground), *relief.layers):
@@ -164,13 +179,17 @@ class _Canvas:
         edge = np.minimum(patch.t, 1 - patch.t) * patch.length
         self.orm[rows][..., 0] -= (0.55 * np.exp(-edge / 0.0012)).astype(np.float32)[:, None]
 
-    def age(self, u: NDArray, s: NDArray, noise: NDArray, sheet: Sheet, width: int, height: int) -> None:
+    def age(
+        self, u: NDArray, s: NDArray, noise: NDArray, sheet: Sheet, width: int, height: int
+    ) -> None:
         """Patina in the hollows, polish on the edges, grain everywhere."""
         from scipy.ndimage import gaussian_filter
 
         texel = float(np.sum(sheet.lengths)) / height
         total = self.relief + self.micro
-        blurred = gaussian_filter(total, (0.0022 / texel,) * 2, mode=("nearest", "wrap"), truncate=2.5)
+        blurred = gaussian_filter(
+            total, (0.0022 / texel,) * 2, mode=("nearest", "wrap"), truncate=2.5
+        )
         hollow = np.clip((blurred - total) / 0.0011, 0, 1) + (1 - self.orm[..., 0])
         hollow = np.clip(hollow * (0.85 + 0.25 * noise), 0, 1)
         worn = np.clip((total - blurred) / 0.0010, 0, 1)
@@ -202,7 +221,9 @@ def _pigment(substance: Substance, patch: Patch, noise: NDArray, seed: int) -> N
     """sRGB colour (H, W, 3), or (3,) when nothing varies it."""
     color = np.array(substance.color, np.float32)
     if substance.tint is not None:
-        color = color + smoothstep(-1.2, 1.6, noise)[..., None] * (np.array(substance.tint, np.float32) - color)
+        color = color + smoothstep(-1.2, 1.6, noise)[..., None] * (
+            np.array(substance.tint, np.float32) - color
+        )
     if substance.veins is not None:
         cells = (5, max(2, round(5 * patch.length / patch.girth)))
         swirl = fractal_noise(patch.u, patch.t, cells, 5, seed + 20, gain=0.6)

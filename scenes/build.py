@@ -1,4 +1,5 @@
-"""Write a scene to a file: ``python -m scenes.build NAME OUT [--triangles N] [--texture-size N]``."""
+"""Write a scene to a file: ``python -m scenes.build NAME OUT [--triangles N] [--texture-size
+N]``."""
 
 from __future__ import annotations
 
@@ -24,8 +25,8 @@ SCENES: dict[str, Callable[..., Asset]] = {
 
 
 def build(name: str, **options: int | None) -> Asset:
-    """The scene ``name``; options that are None keep the scene's own value. Raises InputError for an
-    unknown scene, an option that it does not have, or a value that is not positive."""
+    """The scene ``name``; options that are None keep the scene's own value. Raises InputError for
+    an unknown scene, an option that it does not have, or a value that is not positive."""
     if name not in SCENES:
         raise InputError(f"no scene '{name}'; there are {', '.join(SCENES)}")
     scene = SCENES[name]
@@ -40,7 +41,9 @@ def build(name: str, **options: int | None) -> Asset:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command line; returns the exit code."""
-    parser = argparse.ArgumentParser(prog="python -m scenes.build", description="Write a procedural scene to a file.")
+    parser = argparse.ArgumentParser(
+        prog="python -m scenes.build", description="Write a procedural scene to a file."
+    )
     parser.add_argument("name", nargs="?", help="the scene")
     parser.add_argument("out", nargs="?", help="the file to write (.glb, .gltf, .obj, .usd*)")
     parser.add_argument("--triangles", type=int, help="about this many triangles")

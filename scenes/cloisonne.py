@@ -1,4 +1,5 @@
-"""The belly of the relic: enamel in gold wires. One repeat: a medallion with a rosette, and scrolls."""
+"""The belly of the relic: enamel in gold wires. One repeat: a medallion with a rosette, and
+scrolls."""
 
 from __future__ import annotations
 
@@ -18,9 +19,15 @@ _ANGLES = np.linspace(0, 2 * np.pi, 1200)
 
 
 def cloisonne(
-    count: int, wire: Substance, field: Substance, leaves: Substance, petal: Substance, heart: Substance
+    count: int,
+    wire: Substance,
+    field: Substance,
+    leaves: Substance,
+    petal: Substance,
+    heart: Substance,
 ) -> Ornament:
-    """``count`` repeats around. ``field``: inside the medallion; ``petal`` and ``heart``: its rosette."""
+    """``count`` repeats around. ``field``: inside the medallion; ``petal`` and ``heart``: its
+    rosette."""
 
     def relief(patch: Patch) -> Relief:
         cell = patch.girth / count
@@ -42,7 +49,9 @@ def cloisonne(
         petal_lift = 0.0016 * np.sqrt(np.clip(-rosette / 0.010, 0, 1))
         leaf_lift = 0.0012 * np.sqrt(np.clip(-foliage / 0.004, 0, 1)) * edge
         height = boss + petal_lift + leaf_lift
-        return Relief(height.astype(np.float32), (0.0003 * wire_mask - sag).astype(np.float32), layers)
+        return Relief(
+            height.astype(np.float32), (0.0003 * wire_mask - sag).astype(np.float32), layers
+        )
 
     return relief
 
@@ -109,4 +118,6 @@ def _stencils() -> tuple[Stencil, ...]:
     medallion = (radius - _medallion_radius(angle)).astype(np.float32)
     rosette = (0.6 * (radius - _rosette_radius(angle))).astype(np.float32)
     core = (radius - 0.074).astype(np.float32)
-    return tuple(Stencil(np.ascontiguousarray(d)) for d in (wires, foliage, medallion, rosette, core))
+    return tuple(
+        Stencil(np.ascontiguousarray(d)) for d in (wires, foliage, medallion, rosette, core)
+    )

@@ -26,8 +26,8 @@ class Piece:
 
 @dataclass(frozen=True)
 class Profile:
-    """A profile by its arc length: ``s`` (N,) in [0, 1]; ``points`` and outward ``normals`` (N, 2) in
-    the (radius, height) plane."""
+    """A profile by its arc length: ``s`` (N,) in [0, 1]; ``points`` and outward ``normals`` (N, 2)
+    in the (radius, height) plane."""
 
     s: NDArray
     points: NDArray
@@ -43,8 +43,11 @@ def line(*corners: tuple[float, float]) -> NDArray:
     return np.asarray(corners, np.float64)
 
 
-def arc(start: tuple[float, float], end: tuple[float, float], bulge: float, count: int = 24) -> NDArray:
-    """Half an ellipse from start to end that stands ``bulge`` metres proud to the right of its way up."""
+def arc(
+    start: tuple[float, float], end: tuple[float, float], bulge: float, count: int = 24
+) -> NDArray:
+    """Half an ellipse from start to end that stands ``bulge`` metres proud to the right of its way
+    up."""
     a, b = np.asarray(start, np.float64), np.asarray(end, np.float64)
     angle = np.linspace(0, np.pi, count)[:, None]
     outward = np.array((b[1] - a[1], a[0] - b[0])) / np.linalg.norm(b - a)
@@ -73,7 +76,9 @@ def profile_sheet(pieces: Sequence[Piece], seed: int, dents: tuple = ()) -> tupl
     length = np.concatenate([[0.0], np.cumsum(steps)])
     ends = np.concatenate([[0], np.cumsum(counts)])
     edges = length[ends] / length[-1]
-    girths = np.array([2 * np.pi * np.mean(path[a : b + 1, 0]) for a, b in zip(ends[:-1], ends[1:], strict=True)])
+    girths = np.array(
+        [2 * np.pi * np.mean(path[a : b + 1, 0]) for a, b in zip(ends[:-1], ends[1:], strict=True)]
+    )
     tangent = np.gradient(path, length, axis=0)
     tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
     normals = np.stack([tangent[:, 1], -tangent[:, 0]], axis=1)
@@ -92,8 +97,8 @@ def turn(
 ) -> Mesh:
     """Surface of revolution about +Y with the sheet's relief along the profile's normals.
 
-    ``cross_section``: factor on the radius by angle (radians), 1 for a circle. u runs to the right seen
-    from outside, from +Z."""
+    ``cross_section``: factor on the radius by angle (radians), 1 for a circle. u runs to the right
+    seen from outside, from +Z."""
     u, s = np.arange(columns) / columns, sheet.rows()
     base, normal = profile.at(s)
     height = sheet.height(u, s)
@@ -108,9 +113,15 @@ def turn(
 
 
 def tube(
-    path: NDArray, radius: Callable[[NDArray], NDArray], sheet: Sheet, columns: int, material: Material, name: str
+    path: NDArray,
+    radius: Callable[[NDArray], NDArray],
+    sheet: Sheet,
+    columns: int,
+    material: Material,
+    name: str,
 ) -> Mesh:
-    """Tube along a curve (N, 2) in the (x, y) plane; ``radius``: metres at s in [0, 1], 0 at both ends."""
+    """Tube along a curve (N, 2) in the (x, y) plane; ``radius``: metres at s in [0, 1], 0 at both
+    ends."""
     u, s = np.arange(columns) / columns, sheet.rows()
     arc_length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
     knots = arc_length / arc_length[-1]
@@ -119,20 +130,29 @@ def tube(
     centre, along = _interpolate(s, knots, path), _interpolate(s, knots, tangent)
     side = np.stack([along[:, 1], -along[:, 0]], axis=1)
     bare = radius(s)[:, None]
-    reach = np.where(bare > 0, np.maximum(bare + sheet.height(u, s) * np.minimum(bare / bare.max(), 1), 1e-5), 0)
+    reach = np.where(
+        bare > 0, np.maximum(bare + sheet.height(u, s) * np.minimum(bare / bare.max(), 1), 1e-5), 0
+    )
     angle = 2 * np.pi * u
     offset = reach * np.cos(angle)
     positions = np.stack(
-        [centre[:, :1] + offset * side[:, :1], centre[:, 1:] + offset * side[:, 1:], -reach * np.sin(angle)], axis=-1
+        [
+            centre[:, :1] + offset * side[:, :1],
+            centre[:, 1:] + offset * side[:, 1:],
+            -reach * np.sin(angle),
+        ],
+        axis=-1,
     )
     return grid_mesh(positions, s, material, name)
 
 
 def grid_mesh(positions: NDArray, s: NDArray, material: Material, name: str) -> Mesh:
-    """Closed mesh of a (rows, columns, 3) grid, periodic along columns; u = column, v = 1 - s. A first
-    or last row that is one point becomes a fan."""
+    """Closed mesh of a (rows, columns, 3) grid, periodic along columns; u = column, v = 1 - s. A
+    first or last row that is one point becomes a fan."""
     rows, columns = positions.shape[:2]
-    points = np.concatenate([positions, positions[:, :1]], axis=1).astype(np.float32) + np.float32(0)
+    points = np.concatenate([positions, positions[:, :1]], axis=1).astype(np.float32) + np.float32(
+        0
+    )
     j, i = np.meshgrid(np.arange(rows - 1), np.arange(columns), indexing="ij")
     a = j * (columns + 1) + i
     b, c, d = a + 1, a + columns + 2, a + columns + 1
@@ -145,7 +165,9 @@ def grid_mesh(positions: NDArray, s: NDArray, material: Material, name: str) -> 
     flat = points.reshape(-1, 3)
     uu, vv = np.meshgrid(np.arange(columns + 1) / columns, 1 - s)
     uvs = np.stack([uu, vv], axis=-1).reshape(-1, 2).astype(np.float32)
-    used, faces = np.unique(faces, return_inverse=True)  # a fan leaves one vertex of its end row over
+    used, faces = np.unique(
+        faces, return_inverse=True
+    )  # a fan leaves one vertex of its end row over
     flat, uvs, faces = flat[used], uvs[used], faces.reshape(-1, 3).astype(np.int32)
     return Mesh(flat, faces, vertex_normals(flat, faces), uvs, material=material, name=name)
 
@@ -157,7 +179,9 @@ def place(mesh: Mesh, centre: NDArray, up: NDArray) -> Mesh:
     x /= np.linalg.norm(x)
     rotation = np.stack([x, y, np.cross(x, y)], axis=1)
     positions = (mesh.positions @ rotation.T + centre).astype(np.float32)
-    return replace(mesh, positions=positions, normals=(mesh.normals @ rotation.T).astype(np.float32))
+    return replace(
+        mesh, positions=positions, normals=(mesh.normals @ rotation.T).astype(np.float32)
+    )
 
 
 def join(meshes: Sequence[Mesh], name: str) -> Mesh:
@@ -165,7 +189,9 @@ def join(meshes: Sequence[Mesh], name: str) -> Mesh:
     starts = np.cumsum([0, *(len(m.positions) for m in meshes[:-1])])
     return Mesh(
         np.concatenate([m.positions for m in meshes]),
-        np.concatenate([m.faces + np.int32(k) for m, k in zip(meshes, starts, strict=True)]).astype(np.int32),
+        np.concatenate([m.faces + np.int32(k) for m, k in zip(meshes, starts, strict=True)]).astype(
+            np.int32
+        ),
         np.concatenate([m.normals for m in meshes]),
         np.concatenate([m.uvs for m in meshes]),
         material=meshes[0].material,

@@ -1,7 +1,8 @@
 """Procedural noise on product grids: u runs around (periodic, [0, 1)), s along ([0, 1]).
 
-All the scenes' sheets are grids of (len(s), len(u)) points, so that noise is separable in its lattice
-weights: four gathers per axis, whatever the number of pixels. Seeds give the same numbers everywhere.
+All the scenes' sheets are grids of (len(s), len(u)) points, so that noise is separable in its
+lattice weights: four gathers per axis, whatever the number of pixels. Seeds give the same numbers
+everywhere.
 """
 
 from __future__ import annotations
@@ -32,18 +33,26 @@ def _taps(x: NDArray) -> tuple[NDArray[np.intp], list[NDArray[np.float32]]]:
     """First lattice index and the four uniform cubic B-spline weights at lattice coordinates x."""
     index = np.floor(x).astype(np.intp)
     f = (x - index).astype(np.float32)
-    weights = [(1 - f) ** 3 / 6, (3 * f**3 - 6 * f**2 + 4) / 6, (-3 * f**3 + 3 * f**2 + 3 * f + 1) / 6, f**3 / 6]
+    weights = [
+        (1 - f) ** 3 / 6,
+        (3 * f**3 - 6 * f**2 + 4) / 6,
+        (-3 * f**3 + 3 * f**2 + 3 * f + 1) / 6,
+        f**3 / 6,
+    ]
     return index, weights
 
 
 def fractal_noise(
     u: NDArray, s: NDArray, cells: tuple[int, int], octaves: int, seed: int, gain: float = 0.5
 ) -> NDArray[np.float32]:
-    """Sum of ``octaves`` lattice noises, each twice as fine and ``gain`` times as strong: variance 1."""
+    """Sum of ``octaves`` lattice noises, each twice as fine and ``gain`` times as strong: variance
+    1."""
     total = np.zeros((len(s), len(u)), np.float32)
     amplitude, energy = 1.0, 0.0
     for k in range(octaves):
-        total += np.float32(amplitude) * lattice_noise(u, s, (cells[0] << k, cells[1] << k), seed + k)
+        total += np.float32(amplitude) * lattice_noise(
+            u, s, (cells[0] << k, cells[1] << k), seed + k
+        )
         energy += amplitude**2
         amplitude *= gain
     return total / np.float32(np.sqrt(energy))

@@ -1,8 +1,9 @@
-"""Classical mouldings as reliefs over a band: ropes, beads, gadroons, flutes, petals, scales, meander.
+"""Classical mouldings as reliefs over a band: ropes, beads, gadroons, flutes, petals, scales,
+meander.
 
-Each function takes what shapes it and returns an ornament, a function of a ``Patch``. In all of them
-``f`` runs over [-1, 1] across one repeat. Heights are in metres and vanish at the band's ends, so that
-neighbouring bands meet.
+Each function takes what shapes it and returns an ornament, a function of a ``Patch``. In all of
+them ``f`` runs over [-1, 1] across one repeat. Heights are in metres and vanish at the band's ends,
+so that neighbouring bands meet.
 """
 
 from __future__ import annotations
@@ -22,7 +23,9 @@ def rope(strands: int, turns: float, depth: float) -> Ornament:
 
     def relief(patch: Patch) -> Relief:
         f = _across(patch, strands, turns)
-        return Relief((depth * (np.sqrt(1.02 - f * f) - 0.7) * _fade(patch, 0.12)).astype(np.float32))
+        return Relief(
+            (depth * (np.sqrt(1.02 - f * f) - 0.7) * _fade(patch, 0.12)).astype(np.float32)
+        )
 
     return relief
 
@@ -34,7 +37,9 @@ def beads(count: int, fill: float = 0.47) -> Ornament:
         cell = patch.girth / count
         radius = fill * min(cell, patch.length)
         x, y = _across(patch, count) * cell / 2, (patch.t[:, None] - 0.5) * patch.length
-        return Relief((0.85 * np.sqrt(np.clip(radius**2 - x * x - y * y, 0, None))).astype(np.float32))
+        return Relief(
+            (0.85 * np.sqrt(np.clip(radius**2 - x * x - y * y, 0, None))).astype(np.float32)
+        )
 
     return relief
 
@@ -51,14 +56,18 @@ def gadroons(count: int, turns: float, depth: float) -> Ornament:
 
 
 def flutes(count: int, turns: float, depth: float, arris: float, edge: Substance) -> Ornament:
-    """Concave (parabolic) channels with rounded ends; the ridges between (``arris`` of a repeat wide) are ``edge``."""
+    """Concave (parabolic) channels with rounded ends; the ridges between (``arris`` of a repeat
+    wide) are ``edge``."""
 
     def relief(patch: Patch) -> Relief:
         f = _across(patch, count, turns) / (1 - arris)
         g = _end(patch, patch.girth / (2 * count) * 1.2)
         inside = 1 - f * f - g * g
         ridge = smoothstep(0.16, 0.04, inside)
-        return Relief((-depth * np.clip(inside, 0, 1)).astype(np.float32), layers=((ridge.astype(np.float32), edge),))
+        return Relief(
+            (-depth * np.clip(inside, 0, 1)).astype(np.float32),
+            layers=((ridge.astype(np.float32), edge),),
+        )
 
     return relief
 
@@ -76,10 +85,15 @@ def petals(count: int, depth: float, front: Substance, back: Substance, rim: Sub
             inside = (width - np.abs(f)) * half  # about metres from the leaf's edge
             pillow = np.clip(inside / half, 0, 1)
             rib = np.exp(-((f * half / 0.0016) ** 2)) * smoothstep(0.0, 0.004, inside)
-            leaf = depth * (lift * smoothstep(0, 0.0026, inside) + 0.75 * np.sqrt(pillow)) - 0.5 * depth * rib
+            leaf = (
+                depth * (lift * smoothstep(0, 0.0026, inside) + 0.75 * np.sqrt(pillow))
+                - 0.5 * depth * rib
+            )
             root = smoothstep(0.0, 0.06, patch.t)[:, None]
             mask = smoothstep(-0.0002, 0.0003, inside)
-            height = np.where(inside > 0, np.maximum(height * 0.4, leaf * root), height).astype(np.float32)
+            height = np.where(inside > 0, np.maximum(height * 0.4, leaf * root), height).astype(
+                np.float32
+            )
             layers += [(mask, rim), (smoothstep(0.0016, 0.0021, inside) * (1 - 0.9 * rib), body)]
         return Relief(height, layers=tuple((m.astype(np.float32), body) for m, body in layers))
 
@@ -98,16 +112,25 @@ def tongues(count: int, depth: float, body: Substance, core: Substance, rim: Sub
         wire = smoothstep(-0.0004, 0.0002, inside) * smoothstep(0.0018, 0.0012, inside)
         core_mask = smoothstep(0.0050, 0.0055, inside) * smoothstep(0.82, 0.80, patch.t)[:, None]
         core_wire = smoothstep(0.0038, 0.0042, inside) * smoothstep(0.84, 0.83, patch.t)[:, None]
-        masks = ((smoothstep(0, 0.0004, inside), body), (core_wire, rim), (core_mask, core), (wire, rim))
+        masks = (
+            (smoothstep(0, 0.0004, inside), body),
+            (core_wire, rim),
+            (core_mask, core),
+            (wire, rim),
+        )
         micro = 0.0003 * np.maximum(wire, core_wire * (1 - core_mask))
         return Relief(
-            height.astype(np.float32), micro.astype(np.float32), tuple((m.astype(np.float32), b) for m, b in masks)
+            height.astype(np.float32),
+            micro.astype(np.float32),
+            tuple((m.astype(np.float32), b) for m, b in masks),
         )
 
     return relief
 
 
-def scales(count: int, ranks: int, depth: float, body: Substance, tip: Substance, rim: Substance) -> Ornament:
+def scales(
+    count: int, ranks: int, depth: float, body: Substance, tip: Substance, rim: Substance
+) -> Ornament:
     """Overlapping round scales, points down, ``ranks`` rows of them."""
 
     def relief(patch: Patch) -> Relief:
@@ -120,15 +143,21 @@ def scales(count: int, ranks: int, depth: float, body: Substance, tip: Substance
             distance = np.sqrt((f * 0.98) ** 2 + (below * 0.95) ** 2)
             inside = 1 - distance
             owns = (inside > 0) & (y < rank + 1.6)
-            slope = depth * (0.25 + 0.75 * np.clip(below, 0, 1) ** 1.2) * smoothstep(0, 0.10, inside)
+            slope = (
+                depth * (0.25 + 0.75 * np.clip(below, 0, 1) ** 1.2) * smoothstep(0, 0.10, inside)
+            )
             height = np.where(owns, slope + 0.0004 * rank / ranks, height)
             wire = smoothstep(0.0, 0.03, inside) * smoothstep(0.17, 0.12, inside)
             spot = smoothstep(0.30, 0.34, inside) * smoothstep(0.25, 0.5, below)
             for mask, value in zip(masks, (np.ones_like(distance), spot, wire), strict=True):
                 mask[...] = np.where(owns, value, mask)
         fade = _fade(patch, 0.02)
-        layers = tuple((m.astype(np.float32), b) for m, b in zip(masks, (body, tip, rim), strict=True))
-        return Relief((height * fade).astype(np.float32), (0.0002 * masks[2]).astype(np.float32), layers)
+        layers = tuple(
+            (m.astype(np.float32), b) for m, b in zip(masks, (body, tip, rim), strict=True)
+        )
+        return Relief(
+            (height * fade).astype(np.float32), (0.0002 * masks[2]).astype(np.float32), layers
+        )
 
     return relief
 
@@ -139,7 +168,10 @@ def meander(count: int, depth: float, groove: Substance) -> Ornament:
     def relief(patch: Patch) -> Relief:
         distance = _meander_stencil().sample(patch.u, patch.t, count) * (patch.girth / count)
         cut = smoothstep(0.0005, -0.0005, distance).astype(np.float32)
-        return Relief(-depth * cut, layers=((smoothstep(0.0003, -0.0003, distance).astype(np.float32), groove),))
+        return Relief(
+            -depth * cut,
+            layers=((smoothstep(0.0003, -0.0003, distance).astype(np.float32), groove),),
+        )
 
     return relief
 
@@ -151,7 +183,9 @@ def _meander_stencil() -> Stencil:
     key = [(0, 0), (0, top), (4, top), (4, 1.3), (1.35, 1.3), (1.35, 2.7), (2.7, 2.7)]
     lines = [[(-0.5, 0.0), (period - 0.5, 0.0)], [(a, b) for a, b in key]]
     scale = 1 / period
-    curves = [polyline([((a - 2.0) * scale, (b - top / 2) * scale) for a, b in line]) for line in lines]
+    curves = [
+        polyline([((a - 2.0) * scale, (b - top / 2) * scale) for a, b in line]) for line in lines
+    ]
     return Stencil(stroke_distance(x, y, curves, [np.full(len(c), 0.31 * scale) for c in curves]))
 
 

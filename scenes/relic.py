@@ -32,8 +32,8 @@ _FULL_COUNT = 486_000
 
 
 def relic(triangles: int = 400_000, texture_size: int = 2048) -> Asset:
-    """The urn with about ``triangles`` triangles. ``texture_size``: texels across the body's maps; the
-    other parts have half."""
+    """The urn with about ``triangles`` triangles. ``texture_size``: texels across the body's maps;
+    the other parts have half."""
     density = float(np.sqrt(triangles / _FULL_COUNT))
     body_profile, body_sheet = _body(density)
     half = max(64, texture_size // 2)
@@ -59,7 +59,11 @@ def _plinth(density: float) -> tuple[Profile, Sheet]:
         (line((0.100, 0.048), (0.099, 0.050), (0.085, 0.050)), MARBLE, 4, None),
         (line((0.085, 0.050), (0, 0.050)), MARBLE, 3, None),
     ]
-    return profile_sheet(_pieces(pieces, density), 11, dents=((0.07, 0.42, 0.006, 0.0025), (0.82, 0.62, 0.005, 0.002)))
+    return profile_sheet(
+        _pieces(pieces, density),
+        11,
+        dents=((0.07, 0.42, 0.006, 0.0025), (0.82, 0.62, 0.005, 0.002)),
+    )
 
 
 def _foot(density: float) -> tuple[Profile, Sheet]:
@@ -91,7 +95,9 @@ def _foot(density: float) -> tuple[Profile, Sheet]:
 
 
 def _body(density: float) -> tuple[Profile, Sheet]:
-    belly = cloisonne(MEDALLIONS, wire=GOLD, field=TURQUOISE, leaves=TURQUOISE, petal=IVORY, heart=CORAL)
+    belly = cloisonne(
+        MEDALLIONS, wire=GOLD, field=TURQUOISE, leaves=TURQUOISE, petal=IVORY, heart=CORAL
+    )
     pieces = [
         (line((0, 0.2105), (0.036, 0.2105)), GOLD, 2, None),
         (arc((0.037, 0.211), (0.043, 0.218), 0.003), GOLD, 8, o.rope(44, 1.0, 0.0012)),
@@ -102,9 +108,21 @@ def _body(density: float) -> tuple[Profile, Sheet]:
             o.petals(16, 0.0065, GOLD, IVORY, GOLD),
         ),
         (arc((0.133, 0.293), (0.138, 0.304), 0.0045), GOLD, 11, o.rope(96, 1.6, 0.0022)),
-        (curve((0.139, 0.305), (0.1515, 0.342), (0.1535, 0.372), (0.148, 0.404), (0.1365, 0.432)), COBALT, 44, belly),
+        (
+            curve(
+                (0.139, 0.305), (0.1515, 0.342), (0.1535, 0.372), (0.148, 0.404), (0.1365, 0.432)
+            ),
+            COBALT,
+            44,
+            belly,
+        ),
         (arc((0.136, 0.433), (0.131, 0.443), 0.0045), GOLD, 11, o.rope(96, -1.6, 0.0022)),
-        (curve((0.130, 0.444), (0.124, 0.458), (0.1145, 0.469)), IVORY, 24, o.meander(22, 0.0014, COBALT)),
+        (
+            curve((0.130, 0.444), (0.124, 0.458), (0.1145, 0.469)),
+            IVORY,
+            24,
+            o.meander(22, 0.0014, COBALT),
+        ),
         (arc((0.114, 0.4695), (0.107, 0.476), 0.002), GOLD, 12, o.beads(72)),
         (
             curve((0.106, 0.477), (0.090, 0.490), (0.069, 0.499)),
@@ -142,16 +160,25 @@ def _lid(density: float) -> tuple[Profile, Sheet]:
         (arc((0.023, 0.665), (0.022, 0.673), 0.003), GOLD, 12, o.beads(16)),
         (curve((0.019, 0.674), (0.0115, 0.683), (0.015, 0.692)), IVORY, 10, None),
         (arc((0.016, 0.693), (0.016, 0.698), 0.0025), GOLD, 6, o.rope(28, 1.0, 0.0008)),
-        (curve((0.015, 0.699), (0.0265, 0.712), (0.024, 0.728), (0.009, 0.741)), GOLD, 32, o.gadroons(12, 2.5, 0.0042)),
+        (
+            curve((0.015, 0.699), (0.0265, 0.712), (0.024, 0.728), (0.009, 0.741)),
+            GOLD,
+            32,
+            o.gadroons(12, 2.5, 0.0042),
+        ),
         (arc((0.0085, 0.742), (0.0085, 0.747), 0.002), GOLD, 6, o.rope(16, 1.0, 0.0006)),
         (line((0.008, 0.748), (0, 0.750)), GOLD, 2, None),
     ]
     return profile_sheet(_pieces(pieces, density), 53, dents=((0.2, 0.45, 0.010, 0.002),))
 
 
-def _pieces(rows: list[tuple[NDArray, Substance, int, Callable | None]], density: float) -> list[Piece]:
+def _pieces(
+    rows: list[tuple[NDArray, Substance, int, Callable | None]], density: float
+) -> list[Piece]:
     return [
-        Piece(profile, Band(ground, max(1, round(count * density)), *((carving,) if carving else ())))
+        Piece(
+            profile, Band(ground, max(1, round(count * density)), *((carving,) if carving else ()))
+        )
         for profile, ground, count, carving in rows
     ]
 
@@ -162,20 +189,26 @@ def _columns(count: int, density: float) -> int:
 
 
 def _turned(
-    shape: tuple[Profile, Sheet], columns: int, size: int, name: str, cross_section: Callable | None = None
+    shape: tuple[Profile, Sheet],
+    columns: int,
+    size: int,
+    name: str,
+    cross_section: Callable | None = None,
 ) -> Mesh:
     profile, sheet = shape
     return turn(profile, sheet, columns, paint(sheet, size, size, name), name, cross_section)
 
 
 def _octagon(angle: NDArray) -> NDArray:
-    """Radius of a unit octagon with rounded corners, flats facing the axes (a p-norm of its planes)."""
+    """Radius of a unit octagon with rounded corners, flats facing the axes (a p-norm of its
+    planes)."""
     planes = angle[:, None] - np.arange(8) * (np.pi / 4)
     return 1.0 / np.sum(np.clip(np.cos(planes), 0, None) ** 60, axis=1) ** (1 / 60)
 
 
 def _handles(density: float, texture: int) -> Mesh:
-    """Both handles: a twisted S from belly to rim with collars, and three scrolls that curl off it."""
+    """Both handles: a twisted S from belly to rim with collars, and three scrolls that curl off
+    it."""
     sheet = Sheet(
         (Band(GOLD, max(24, round(240 * density)), o.rope(5, 16.0, 0.0034)),),
         np.array([0.0, 1.0]), np.array([0.055]), np.array([0.30]), 71,
@@ -198,7 +231,9 @@ def _handles(density: float, texture: int) -> Mesh:
     ):
         t = np.linspace(0, 1, 300)
         radius, angle = outer * (0.12 + 0.88 * (1 - t) ** 1.2), start + hand * 2 * np.pi * turns * t
-        path = np.stack([centre[0] + radius * np.cos(angle), centre[1] + radius * np.sin(angle)], axis=1)
+        path = np.stack(
+            [centre[0] + radius * np.cos(angle), centre[1] + radius * np.sin(angle)], axis=1
+        )
         parts.append(tube(path, _scroll_radius, scroll, columns, material, "scroll"))
     right = join(parts, "handle")
     return join([right, _half_turn(right)], "handles")
@@ -220,7 +255,12 @@ def _scroll_radius(s: NDArray) -> NDArray:
 def _half_turn(mesh: Mesh) -> Mesh:
     turned = np.array((-1, 1, -1), np.float32)
     return Mesh(
-        mesh.positions * turned, mesh.faces, mesh.normals * turned, mesh.uvs, material=mesh.material, name=mesh.name
+        mesh.positions * turned,
+        mesh.faces,
+        mesh.normals * turned,
+        mesh.uvs,
+        material=mesh.material,
+        name=mesh.name,
     )
 
 
@@ -242,7 +282,13 @@ def _jewels(profile: Profile, sheet: Sheet, density: float) -> list[Mesh]:
         seat = 0.0625 * around + np.array((0.0, 0.163, 0.0))
         pearls.append(place(_gem(0.0060, 0.0058, PEARL, density), seat, around))
         settings.append(place(_setting(0.0064, 0.0016, density), seat, around))
-    rubies.append(place(_gem(0.0125, 0.0125, RUBY, density), np.array((0.0, 0.758, 0.0)), np.array((0.0, 1.0, 0.0))))
+    rubies.append(
+        place(
+            _gem(0.0125, 0.0125, RUBY, density),
+            np.array((0.0, 0.758, 0.0)),
+            np.array((0.0, 1.0, 0.0)),
+        )
+    )
     return [join(rubies, "rubies"), join(pearls, "pearls"), join(settings, "settings")]
 
 
@@ -259,7 +305,14 @@ def _setting(radius: float, thickness: float, density: float) -> Mesh:
     """A corded ring on a disc about the origin."""
     pieces = [
         (line((0, -0.004), (radius, -0.004)), GOLD, 1, None),
-        (arc((radius, -0.004), (radius, thickness), 0.9 * thickness), GOLD, 9, o.rope(20, 1.5, 0.0007)),
+        (
+            arc((radius, -0.004), (radius, thickness), 0.9 * thickness),
+            GOLD,
+            9,
+            o.rope(20, 1.5, 0.0007),
+        ),
         (line((radius, thickness), (0, thickness - 0.003)), GOLD, 1, None),
     ]
-    return turn(*profile_sheet(_pieces(pieces, density), 0), _columns(64, density), SETTING, "setting")
+    return turn(
+        *profile_sheet(_pieces(pieces, density), 0), _columns(64, density), SETTING, "setting"
+    )

@@ -1,4 +1,5 @@
-"""Render docs/*.md to a folder of plain HTML pages; a link to a page or picture that does not exist is an error."""
+"""Render docs/*.md to a folder of plain HTML pages; a link to a page or picture that does not exist
+is an error."""
 
 from __future__ import annotations
 
@@ -34,7 +35,8 @@ def main(target: Path) -> None:
         body = re.sub(r'href="([\w-]+)\.md', r'href="\1.html', body)
         title = html.escape(text.splitlines()[0].lstrip("# "))
         (target / f"{page.stem}.html").write_text(
-            f'<!doctype html><meta charset="utf-8"><title>{title}</title><style>{STYLE}</style>{body}', encoding="utf-8"
+            f'<!doctype html><meta charset="utf-8"><title>{title}</title><style>{STYLE}</style>{body}',
+            encoding="utf-8",
         )
     if (source / "images").is_dir():
         shutil.copytree(source / "images", target / "images", dirs_exist_ok=True)

@@ -16,7 +16,8 @@ from appearance_opt.asset.types import Asset, Material, Mesh, Texture
 from tests import looks
 from tests.inputs import watch_jobs
 
-# what a shell starts in the background ignores interrupts, and so does all that it starts: tests send some
+# what a shell starts in the background ignores interrupts, and so does all that it starts: tests
+# send some
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # the same examples everywhere, however long they take on a busy machine
@@ -24,13 +25,18 @@ hypothesis.settings.register_profile(
     "anywhere",
     derandomize=True,
     deadline=None,
-    suppress_health_check=[hypothesis.HealthCheck.too_slow, hypothesis.HealthCheck.function_scoped_fixture],
+    suppress_health_check=[
+        hypothesis.HealthCheck.too_slow,
+        hypothesis.HealthCheck.function_scoped_fixture,
+    ],
 )
 hypothesis.settings.load_profile("anywhere")
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    parser.addoption("--device", default="cpu", choices=("cpu", "cuda"), help="what Dr.Jit computes on")
+    parser.addoption(
+        "--device", default="cpu", choices=("cpu", "cuda"), help="what Dr.Jit computes on"
+    )
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -49,9 +55,9 @@ def small_looks(variant: str) -> Iterator[None]:
 
 @pytest.fixture
 def one_thread(variant: str) -> Iterator[float]:
-    """On the CPU one thread alone computes, so that sums come in one order and equal fits end bit by bit equal. Hands
-    out how far they may end apart: on a GPU, threads add up gradients in any order, and Adam makes a whole step of the
-    sign of a vanishing one."""
+    """On the CPU one thread alone computes, so that sums come in one order and equal fits end bit
+    by bit equal. Hands out how far they may end apart: on a GPU, threads add up gradients in any
+    order, and Adam makes a whole step of the sign of a vanishing one."""
     before = dr.thread_count()
     if variant == backend.CPU:
         dr.set_thread_count(1)
@@ -74,17 +80,25 @@ def assets_dir() -> Path:
     return folder
 
 
-def grid_sphere(rows: int, columns: int, radius: float = 1.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def grid_sphere(
+    rows: int, columns: int, radius: float = 1.0
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """UV sphere with a seam: positions, faces, uvs (glTF convention, outward winding)."""
     v, u = np.meshgrid(np.linspace(0, 1, rows + 1), np.linspace(0, 1, columns + 1), indexing="ij")
     polar, azimuth = v * np.pi, u * 2 * np.pi
-    p = np.stack([np.sin(polar) * np.sin(azimuth), np.cos(polar), np.sin(polar) * np.cos(azimuth)], axis=-1)
+    p = np.stack(
+        [np.sin(polar) * np.sin(azimuth), np.cos(polar), np.sin(polar) * np.cos(azimuth)], axis=-1
+    )
     i, j = (x.ravel() for x in np.meshgrid(np.arange(rows), np.arange(columns), indexing="ij"))
     a = i * (columns + 1) + j
     b, c, d = a + columns + 1, a + columns + 2, a + 1
     faces = np.concatenate([np.stack([a, b, c], 1)[i < rows - 1], np.stack([a, c, d], 1)[i > 0]])
     uvs = np.stack([u, v], axis=-1).reshape(-1, 2)
-    return (p.reshape(-1, 3) * radius).astype(np.float32), faces.astype(np.int32), uvs.astype(np.float32)
+    return (
+        (p.reshape(-1, 3) * radius).astype(np.float32),
+        faces.astype(np.int32),
+        uvs.astype(np.float32),
+    )
 
 
 def make_asset(rows: int = 24, columns: int = 48, size: int = 64, seed: int = 0) -> Asset:

@@ -21,15 +21,16 @@ def hashes(files: Iterable[Path]) -> dict[Path, str]:
 
 @contextmanager
 def unchanged(folder: Path, *written: str) -> Iterator[None]:
-    """Fails if a file that is in ``folder`` is another one afterwards, but for names that match ``written``."""
+    """Fails if a file that is in ``folder`` is another one afterwards, but for names that match
+    ``written``."""
     before = hashes(p for p in folder.iterdir() if not any(fnmatchcase(p.name, w) for w in written))
     yield
     assert hashes(before) == before
 
 
 def watch_jobs(monkeypatch: pytest.MonkeyPatch) -> None:
-    """From now on every job in this process fails if it changes a file that its inputs consist of, or one beside them
-    that it does not write."""
+    """From now on every job in this process fails if it changes a file that its inputs consist of,
+    or one beside them that it does not write."""
     seen: dict[Path, str] = {}
     check_inputs, held = Outputs.check_inputs, Outputs.held
 
@@ -45,7 +46,10 @@ def watch_jobs(monkeypatch: pytest.MonkeyPatch) -> None:
                 if path in files
                 or (
                     not path.name.startswith(".")
-                    and not any(path.parent == folder and fnmatchcase(path.name, name) for folder, name in patterns)
+                    and not any(
+                        path.parent == folder and fnmatchcase(path.name, name)
+                        for folder, name in patterns
+                    )
                 )
             )
         )

@@ -1,4 +1,5 @@
-"""Jobs look at the mesh in many large views: where texels are missing, where triangles should go, for the report.
+"""Jobs look at the mesh in many large views: where texels are missing, where triangles should go,
+for the report.
 
 What they decide by these views is tested on its own; tests of whole jobs need few and small ones.
 """
@@ -37,8 +38,8 @@ def restore(before: dict[str, dict[str, int]]) -> None:
             setattr(import_module(name), constant, value)
 
 
-# `python -m` ends by the signal itself, whatever the exit code, when an interrupt came while a C extension ran Python
-# code
+# `python -m` ends by the signal itself, whatever the exit code, when an interrupt came while a C
+# extension ran Python code
 COMMAND = """
 import sys
 from tests.looks import make_small
@@ -46,7 +47,8 @@ make_small()
 from appearance_opt.cli import main
 sys.exit(main())
 """
-"""Python code of the installed command with small looks, for ``python -c`` with this checkout in PYTHONPATH."""
+"""Python code of the installed command with small looks, for ``python -c`` with this checkout in
+PYTHONPATH."""
 
 ENVIRONMENT = {**os.environ, "PYTHONPATH": str(Path(__file__).resolve().parents[1])}
 """Of processes: the package beside these tests, whatever is installed."""

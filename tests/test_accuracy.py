@@ -29,8 +29,8 @@ def test_ray_positions_are_centred_and_apart(count: int) -> None:
     assert points.min() > 0 and points.max() < 1
     # an off-centre pattern shifts the image; float32 rounding of the mean alone is left
     np.testing.assert_allclose(points.mean(0), 0.5, atol=1e-7)
-    # the largest squared distance that n points can keep is 2 / sqrt(3) / n (hexagonal); measured 58 % of
-    # that at worst (3 points)
+    # the largest squared distance that n points can keep is 2 / sqrt(3) / n (hexagonal); measured
+    # 58 % of that at worst (3 points)
     gaps = points[:, None] - points[None]
     gaps -= np.round(gaps)
     squared = np.sum(gaps**2, -1) + np.eye(count) * 10
@@ -58,7 +58,9 @@ def test_silhouettes_know_the_coverage_of_their_pixels() -> None:
     surface, maps = model.surface(model.positions()), model.maps(None)
     quality = Quality(4.0, 4, 1)
     with dr.suspend_grad():
-        batch = gradient.render(model.scene, surface, maps, model.topology.edges, records, grid, quality, 0)
+        batch = gradient.render(
+            model.scene, surface, maps, model.topology.edges, records, grid, quality, 0
+        )
         exact = deferred.render_image(model.scene, surface, maps, records, grid, 1024)
     crossed = np.unique(np.array(batch.edges.pixel))
     error = (np.array(batch.image) - np.array(exact)).reshape(-1, 4)[crossed, 3]
@@ -80,7 +82,9 @@ def test_functions_in_single_precision_keep_their_digits(variant: str) -> None:
     assert worst["mesh_ops.vertex_normals", "rough sphere"] < 1e-6
     assert worst["mesh_ops.vertex_tangents", "rough sphere"] < 1e-6
     # measured 2.1e-5: rays of float32 pixel positions
-    assert worst["surface.interpolate, position", "triangles seen at a cosine of 0.2"] < 1e-4 * device
+    assert (
+        worst["surface.interpolate, position", "triangles seen at a cosine of 0.2"] < 1e-4 * device
+    )
 
 
 @pytest.mark.parametrize("roughness", [0.0, 0.08, 0.3, 1.0])
@@ -110,7 +114,8 @@ def test_tone_map_at_zero_the_knee_and_far_up() -> None:
 
 @pytest.mark.parametrize("wrap", list(textures.WRAPS))
 def test_lookups_equal_those_of_openimageio(wrap: str) -> None:
-    # measured 1.2e-7 for powers of two, 3e-6 else: positions are rounded before their fraction is taken
+    # measured 1.2e-7 for powers of two, 3e-6 else: positions are rounded before their fraction is
+    # taken
     assert textures.bilinear((64, 32), wrap) < 1e-6
     assert textures.bilinear((37, 5), wrap) < 1e-5
 
@@ -124,11 +129,14 @@ def test_mip_levels_and_trilinear_lookups_equal_those_of_openimageio() -> None:
 @pytest.mark.parametrize("name", ["ball", "mirrored", "slivers"])
 def test_tangents_equal_those_of_mikktspace(name: str) -> None:
     with np.load(Path(__file__).parent / "data" / "mikktspace.npz") as data:
-        p, n, uv, f, expected = (data[f"{name}/{k}"] for k in ("positions", "normals", "uvs", "faces", "corners"))
+        p, n, uv, f, expected = (
+            data[f"{name}/{k}"] for k in ("positions", "normals", "uvs", "faces", "corners")
+        )
     _, faces, tangents = split_and_tangents(p, n, uv, f)
     corners = tangents[faces]
     np.testing.assert_array_equal(corners[..., 3], expected[..., 3])
-    # measured 1.6e-5 (0.0009 degrees) among slivers, 2.5e-6 elsewhere: MikkTSpace works in single precision
+    # measured 1.6e-5 (0.0009 degrees) among slivers, 2.5e-6 elsewhere: MikkTSpace works in single
+    # precision
     np.testing.assert_allclose(corners[..., :3], expected[..., :3], atol=5e-5)
 
 

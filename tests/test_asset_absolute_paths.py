@@ -1,4 +1,5 @@
-"""Textures under absolute paths of another machine: found by name, ignored on demand, never read from elsewhere."""
+"""Textures under absolute paths of another machine: found by name, ignored on demand, never read
+from elsewhere."""
 
 from __future__ import annotations
 
@@ -44,13 +45,17 @@ def write(folder: Path, suffix: str, ball: Asset, reference: str) -> Path:
 @pytest.mark.parametrize("reference", ELSEWHERE)
 def test_absolute_paths(tmp_path: Path, ball: Asset, suffix: str, reference: str) -> None:
     path = write(tmp_path / "asset", suffix, ball, reference)
-    with pytest.raises(InputError, match=r"outside its own folder, where there is no 't\.png'.*--missing-textures"):
+    with pytest.raises(
+        InputError, match=r"outside its own folder, where there is no 't\.png'.*--missing-textures"
+    ):
         load(path)
     asset = load(path, missing_textures="ignore")
     assert asset.meshes[0].material.base_color_texture is None
     assert any("t.png" in n and "ignored" in n for n in asset.notes)
     (tmp_path / "t.png").write_bytes(images.encode_png(PIXELS))
-    np.testing.assert_array_equal(load(path, root=tmp_path).meshes[0].material.base_color_texture.pixels, PIXELS)
+    np.testing.assert_array_equal(
+        load(path, root=tmp_path).meshes[0].material.base_color_texture.pixels, PIXELS
+    )
     (path.parent / "t.png").write_bytes(images.encode_png(PIXELS + 1))
     asset = load(path)
     np.testing.assert_array_equal(asset.meshes[0].material.base_color_texture.pixels, PIXELS + 1)

@@ -30,7 +30,9 @@ def stored(kind: str, space: str) -> Texture:
 @pytest.mark.parametrize("suffix", [".glb", ".usda", ".obj"])
 @pytest.mark.parametrize("space", ["srgb", "linear"])
 @pytest.mark.parametrize("kind", SCALES)
-def test_a_round_trip_keeps_linear_values(tmp_path: Path, ball: Asset, suffix: str, space: str, kind: str) -> None:
+def test_a_round_trip_keeps_linear_values(
+    tmp_path: Path, ball: Asset, suffix: str, space: str, kind: str
+) -> None:
     given = stored(kind, space)
     material = Material(
         "m", metalness=1.0, base_color_texture=given, orm_texture=given, normal_texture=given,
@@ -39,9 +41,14 @@ def test_a_round_trip_keeps_linear_values(tmp_path: Path, ball: Asset, suffix: s
     save(Asset((replace(ball.meshes[0], material=material),)), tmp_path / f"x{suffix}")
     again = load(tmp_path / f"x{suffix}").meshes[0].material
     slots = ("base_color_texture", "normal_texture", "emission_texture")
-    for got, channels in (*((getattr(again, n), slice(3)) for n in slots), (again.orm_texture, slice(1, 3))):
+    for got, channels in (
+        *((getattr(again, n), slice(3)) for n in slots),
+        (again.orm_texture, slice(1, 3)),
+    ):
         # half a step of eight bits in either encoding: measured 0.0021 and 0.0023
-        np.testing.assert_allclose(got.linear()[..., channels], given.linear()[..., channels], atol=0.0035)
+        np.testing.assert_allclose(
+            got.linear()[..., channels], given.linear()[..., channels], atol=0.0035
+        )
 
 
 def test_integers_in_the_slot_s_encoding_are_not_touched() -> None:
@@ -102,11 +109,19 @@ def Mesh "m" (prepend apiSchemas = ["MaterialBindingAPI"]) {{
         ("rgb16.png", "", 0.5),
     ],
 )
-def test_auto_is_srgb_for_eight_bits_of_colour_alone(tmp_path: Path, file: str, space: str, expected: float) -> None:
+def test_auto_is_srgb_for_eight_bits_of_colour_alone(
+    tmp_path: Path, file: str, space: str, expected: float
+) -> None:
     """UsdPreviewSurface specification, UsdUVTexture, sourceColorSpace."""
     (tmp_path / "t.exr").write_bytes(images.encode_exr(np.full((2, 2, 3), 0.5, np.float32)))
-    for name, channels, kind in (("rgb8", 3, np.uint8), ("rgba8", 4, np.uint8), ("grey8", 1, np.uint8)):
-        (tmp_path / f"{name}.png").write_bytes(images.encode_png(np.full((2, 2, channels), 128, kind)))
+    for name, channels, kind in (
+        ("rgb8", 3, np.uint8),
+        ("rgba8", 4, np.uint8),
+        ("grey8", 1, np.uint8),
+    ):
+        (tmp_path / f"{name}.png").write_bytes(
+            images.encode_png(np.full((2, 2, channels), 128, kind))
+        )
     (tmp_path / "rgb16.png").write_bytes(images.encode_png(np.full((2, 2, 3), 32768, np.uint16)))
     (tmp_path / "x.usda").write_text(STAGE.format(file=file, space=space))
     material = load(tmp_path / "x.usda").meshes[0].material

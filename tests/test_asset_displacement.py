@@ -34,7 +34,10 @@ def test_16_bits_hold_heights_to_half_a_step(heights: np.ndarray) -> None:
 
 def test_files_carry_scale_and_mid_level(heights: np.ndarray, tmp_path: Path) -> None:
     d = displacement_of(heights)
-    for name, data, scale, mid in (("h.png", height_png(d), d.scale, d.mid), ("h.exr", height_exr(heights), 1.0, 0.0)):
+    for name, data, scale, mid in (
+        ("h.png", height_png(d), d.scale, d.mid),
+        ("h.exr", height_exr(heights), 1.0, 0.0),
+    ):
         (tmp_path / name).write_bytes(data)
         spec = oiio.ImageInput.open(str(tmp_path / name)).spec()
         assert float(spec.getattribute("DisplacementScale")) == pytest.approx(scale, rel=1e-6)
@@ -58,11 +61,15 @@ def test_gltf_names_its_companion(ball: Asset, heights: np.ndarray, tmp_path: Pa
     pixels = decode((tmp_path / "my ball_displacement.png").read_bytes(), "companion")
     found = (pixels[..., 0] / 65535 - entry["midLevel"]) * entry["scale"]
     np.testing.assert_allclose(found, heights, atol=1.01 * entry["scale"] / 131070)
-    assert material["occlusionTexture"] == material["pbrMetallicRoughness"]["metallicRoughnessTexture"]
+    assert (
+        material["occlusionTexture"] == material["pbrMetallicRoughness"]["metallicRoughnessTexture"]
+    )
     assert load(tmp_path / "my ball.gltf").triangle_count == asset.triangle_count
 
 
-def test_usd_displacement_is_in_scene_units(ball: Asset, heights: np.ndarray, tmp_path: Path) -> None:
+def test_usd_displacement_is_in_scene_units(
+    ball: Asset, heights: np.ndarray, tmp_path: Path
+) -> None:
     from pxr import Usd, UsdShade
 
     save(displaced(ball, heights), tmp_path / "ball.usda")
@@ -75,6 +82,8 @@ def test_usd_displacement_is_in_scene_units(ball: Asset, heights: np.ndarray, tm
     scale, bias = (sampler.GetInput(n).Get()[0] for n in ("scale", "bias"))
     pixels = decode((tmp_path / sampler.GetInput("file").Get().path).read_bytes(), "companion")
     # scale and bias are stored as float32
-    np.testing.assert_allclose(pixels[..., 0] / 65535 * scale + bias, heights, atol=1.02 * scale / 131070)
+    np.testing.assert_allclose(
+        pixels[..., 0] / 65535 * scale + bias, heights, atol=1.02 * scale / 131070
+    )
     material = next(UsdShade.Material(p) for p in stage.Traverse() if p.IsA(UsdShade.Material))
     assert material.GetDisplacementOutput().HasConnectedSource()

@@ -27,7 +27,11 @@ def write_glb(path: Path, document: dict, binary: bytes = b"") -> None:
     binary += b"\0" * (-len(binary) % 4)
     head = struct.pack("<4sII", b"glTF", 2, 28 + len(text) + len(binary))
     path.write_bytes(
-        head + struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(binary), b"BIN\0") + binary
+        head
+        + struct.pack("<I4s", len(text), b"JSON")
+        + text
+        + struct.pack("<I4s", len(binary), b"BIN\0")
+        + binary
     )
 
 
@@ -55,8 +59,12 @@ def test_round_trip_is_exact(tmp_path: Path, ball: Asset, suffix: str) -> None:
     used = np.unique(mesh.faces)  # unused pole vertices are dropped on loading
     np.testing.assert_array_equal(again.positions, mesh.positions[used])
     np.testing.assert_array_equal(again.uvs, mesh.uvs[used])
-    np.testing.assert_array_equal(again.material.base_color_texture.pixels, mesh.material.base_color_texture.pixels)
-    np.testing.assert_array_equal(again.material.orm_texture.pixels, mesh.material.orm_texture.pixels)
+    np.testing.assert_array_equal(
+        again.material.base_color_texture.pixels, mesh.material.base_color_texture.pixels
+    )
+    np.testing.assert_array_equal(
+        again.material.orm_texture.pixels, mesh.material.orm_texture.pixels
+    )
     assert again.material.base_color_texture.color_space == "srgb"
     assert np.array_equal(used[again.faces], mesh.faces)
 
@@ -67,7 +75,9 @@ def test_round_trip_of_random_triangles(tmp_path: Path, count: int, seed: int) -
     rng = np.random.default_rng(seed)
     positions = rng.normal(size=(3 * count, 3)).astype(np.float32)
     mesh = Mesh(
-        positions, np.arange(3 * count, dtype=np.int32).reshape(-1, 3), material=Material(base_color=(0.2, 0.4, 0.6))
+        positions,
+        np.arange(3 * count, dtype=np.int32).reshape(-1, 3),
+        material=Material(base_color=(0.2, 0.4, 0.6)),
     )
     save(Asset((mesh,)), tmp_path / "x.glb")
     again = load(tmp_path / "x.glb").meshes[0]
@@ -76,8 +86,13 @@ def test_round_trip_of_random_triangles(tmp_path: Path, count: int, seed: int) -
 
 
 @settings(max_examples=120)
-@given(cut=st.integers(0, 2000), flips=st.lists(st.tuples(st.integers(0, 5000), st.integers(1, 255)), max_size=4))
-def test_damaged_files_are_refused_or_read(tmp_path: Path, cut: int, flips: list[tuple[int, int]]) -> None:
+@given(
+    cut=st.integers(0, 2000),
+    flips=st.lists(st.tuples(st.integers(0, 5000), st.integers(1, 255)), max_size=4),
+)
+def test_damaged_files_are_refused_or_read(
+    tmp_path: Path, cut: int, flips: list[tuple[int, int]]
+) -> None:
     document, binary = triangle_document()
     write_glb(tmp_path / "whole.glb", document, binary)
     data = bytearray((tmp_path / "whole.glb").read_bytes())
@@ -101,7 +116,9 @@ def test_node_transforms_and_mirroring(tmp_path: Path) -> None:
         document["meshes"][0]["primitives"][0]["attributes"][name] = k
         accessor = {"bufferView": k, "componentType": 5126, "count": 3, "type": f"VEC{len(row)}"}
         document["accessors"].append(accessor)
-        document["bufferViews"].append({"buffer": 0, "byteOffset": len(binary), "byteLength": len(data)})
+        document["bufferViews"].append(
+            {"buffer": 0, "byteOffset": len(binary), "byteLength": len(data)}
+        )
         binary += data
     document["buffers"][0]["byteLength"] = len(binary)
     write_glb(tmp_path / "x.glb", document, binary)
@@ -111,13 +128,16 @@ def test_node_transforms_and_mirroring(tmp_path: Path) -> None:
     # a mirrored node keeps its outside outside
     assert np.cross(p[1] - p[0], p[2] - p[0])[2] > 0
     np.testing.assert_array_equal(mesh.normals, np.tile([0, 0, 1], (3, 1)))
-    # the bitangent is that of the file, (0, 1, 0), which the node leaves as it is: cross(normal, tangent) is not
+    # the bitangent is that of the file, (0, 1, 0), which the node leaves as it is: cross(normal,
+    # tangent) is not
     np.testing.assert_array_equal(mesh.tangents, np.tile([-1, 0, 0, -1], (3, 1)))
 
 
 def test_strips_become_triangles_of_one_winding(tmp_path: Path) -> None:
     positions = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]], np.float32)
-    document, _ = triangle_document(bufferViews=[{"buffer": 0, "byteLength": 48}], buffers=[{"byteLength": 48}])
+    document, _ = triangle_document(
+        bufferViews=[{"buffer": 0, "byteLength": 48}], buffers=[{"byteLength": 48}]
+    )
     document["accessors"][0]["count"] = 4
     document["meshes"][0]["primitives"][0]["mode"] = 5
     write_glb(tmp_path / "x.glb", document, positions.tobytes())
@@ -150,13 +170,21 @@ def test_unusable_files_say_why(tmp_path: Path, change: dict, words: str) -> Non
 
 
 def draco_document(points: np.ndarray, uvs: np.ndarray, faces: np.ndarray) -> tuple[dict, bytes]:
-    """A file whose geometry is compressed and has no other data; texture coordinates are normalized bytes."""
+    """A file whose geometry is compressed and has no other data; texture coordinates are normalized
+    bytes."""
     dracopy = pytest.importorskip("DracoPy")
     data = dracopy.encode(
-        points, faces, quantization_bits=24, preserve_order=True, generic_attributes={1: (uvs * 255).astype(np.uint8)}
+        points,
+        faces,
+        quantization_bits=24,
+        preserve_order=True,
+        generic_attributes={1: (uvs * 255).astype(np.uint8)},
     )
     count = {"count": len(points)}
-    extension = {"bufferView": 0, "attributes": {"POSITION": 2, "TEXCOORD_0": 1}}  # the encoder numbers positions last
+    extension = {
+        "bufferView": 0,
+        "attributes": {"POSITION": 2, "TEXCOORD_0": 1},
+    }  # the encoder numbers positions last
     document, _ = triangle_document(
         meshes=[
             {
@@ -218,17 +246,28 @@ def test_without_the_package_draco_names_it_or_takes_the_other_data(
     assert len(load(tmp_path / "both.glb").meshes[0].faces) == 1
 
 
-def meshopt_document(extension: str = "EXT_meshopt_compression", filtered: bool = False) -> tuple[dict, bytes]:
-    """QUAD as gltfpack would write it: compressed positions and triangles, and a buffer that only stands for the
-    plain ones; ``filtered``: positions as mantissas of 20 bits that share their exponents."""
+def meshopt_document(
+    extension: str = "EXT_meshopt_compression", filtered: bool = False
+) -> tuple[dict, bytes]:
+    """QUAD as gltfpack would write it: compressed positions and triangles, and a buffer that only
+    stands for the plain ones; ``filtered``: positions as mantissas of 20 bits that share their
+    exponents."""
     meshopt = pytest.importorskip("meshopt")
     points, _, faces = QUAD
     faces = faces.astype(np.uint16)
     stored = meshopt.encode_filter_exp(points, 20) if filtered else points
-    parts = [meshopt.encode_gltf_buffer(stored, "ATTRIBUTES"), meshopt.encode_gltf_buffer(faces, "TRIANGLES")]
+    parts = [
+        meshopt.encode_gltf_buffer(stored, "ATTRIBUTES"),
+        meshopt.encode_gltf_buffer(faces, "TRIANGLES"),
+    ]
     lengths = [len(p) for p in parts]
     packed = [
-        {"count": len(points), "byteStride": 12, "mode": "ATTRIBUTES", "filter": "EXPONENTIAL" if filtered else "NONE"},
+        {
+            "count": len(points),
+            "byteStride": 12,
+            "mode": "ATTRIBUTES",
+            "filter": "EXPONENTIAL" if filtered else "NONE",
+        },
         {"count": faces.size, "byteStride": 2, "mode": "TRIANGLES"},
     ]
     for k, (view, length) in enumerate(zip(packed, lengths, strict=True)):
@@ -243,7 +282,10 @@ def meshopt_document(extension: str = "EXT_meshopt_compression", filtered: bool 
             {"buffer": 1, "byteLength": 48, "byteStride": 12, "extensions": {extension: packed[0]}},
             {"buffer": 1, "byteOffset": 48, "byteLength": 12, "extensions": {extension: packed[1]}},
         ],
-        buffers=[{"byteLength": sum(lengths)}, {"byteLength": 60, "extensions": {extension: {"fallback": True}}}],
+        buffers=[
+            {"byteLength": sum(lengths)},
+            {"byteLength": 60, "extensions": {extension: {"fallback": True}}},
+        ],
         extensionsUsed=[extension],
         extensionsRequired=[extension],
     )
@@ -256,11 +298,15 @@ def test_meshopt_compressed_geometry(tmp_path: Path, extension: str, filtered: b
     points, _, faces = QUAD
     write_glb(tmp_path / "x.glb", *meshopt_document(extension, filtered))
     mesh = load(tmp_path / "x.glb").meshes[0]
-    found, wanted = (sorted(map(sorted, p.tolist())) for p in (mesh.positions[mesh.faces], points[faces]))
+    found, wanted = (
+        sorted(map(sorted, p.tolist())) for p in (mesh.positions[mesh.faces], points[faces])
+    )
     np.testing.assert_allclose(found, wanted, atol=1e-5 if filtered else 0)
 
 
-@pytest.mark.parametrize("change", [{"count": 2**40}, {"count": -3}, {"byteStride": 13}, {"mode": "POINTS"}])
+@pytest.mark.parametrize(
+    "change", [{"count": 2**40}, {"count": -3}, {"byteStride": 13}, {"mode": "POINTS"}]
+)
 def test_meshopt_data_that_cannot_be_is_refused(tmp_path: Path, change: dict) -> None:
     document, data = meshopt_document()
     document["bufferViews"][0]["extensions"]["EXT_meshopt_compression"].update(change)
@@ -311,7 +357,9 @@ def test_a_degenerate_face_is_dropped_with_a_note(tmp_path: Path, ball: Asset) -
 def test_output_passes_the_khronos_validator(tmp_path: Path, ball: Asset) -> None:
     node = shutil.which("node")
     found = node and subprocess.run(
-        [node, "-e", "require.resolve('gltf-validator')"], capture_output=True, cwd=Path(__file__).parents[1]
+        [node, "-e", "require.resolve('gltf-validator')"],
+        capture_output=True,
+        cwd=Path(__file__).parents[1],
     )
     if not found or found.returncode:
         pytest.skip("node with the package gltf-validator is not there")

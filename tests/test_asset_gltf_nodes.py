@@ -1,4 +1,5 @@
-"""What glTF's nodes and the lack of normals make of a mesh: flat shading, skins, instances, reflections, extensions."""
+"""What glTF's nodes and the lack of normals make of a mesh: flat shading, skins, instances,
+reflections, extensions."""
 
 from __future__ import annotations
 
@@ -22,15 +23,28 @@ CODES = {"float32": 5126, "uint8": 5121, "uint16": 5123, "uint32": 5125, "int16"
 
 
 def document(
-    attributes: dict[str, np.ndarray], faces: np.ndarray | None = None, more: tuple[np.ndarray, ...] = (), **top: object
+    attributes: dict[str, np.ndarray],
+    faces: np.ndarray | None = None,
+    more: tuple[np.ndarray, ...] = (),
+    **top: object,
 ) -> tuple[dict, bytes]:
-    """One primitive. Accessors: its attributes in their order, ``more``, its faces. ``top``: other top-level keys."""
-    arrays = [*attributes.values(), *more, *([] if faces is None else [faces.reshape(-1, 1).astype(np.uint32)])]
+    """One primitive. Accessors: its attributes in their order, ``more``, its faces. ``top``: other
+    top-level keys."""
+    arrays = [
+        *attributes.values(),
+        *more,
+        *([] if faces is None else [faces.reshape(-1, 1).astype(np.uint32)]),
+    ]
     views, accessors, binary = [], [], b""
     for k, a in enumerate(arrays):
         views.append({"buffer": 0, "byteOffset": len(binary), "byteLength": a.nbytes})
         accessors.append(
-            {"bufferView": k, "componentType": CODES[str(a.dtype)], "count": len(a), "type": TYPES[a.shape[1]]}
+            {
+                "bufferView": k,
+                "componentType": CODES[str(a.dtype)],
+                "count": len(a),
+                "type": TYPES[a.shape[1]],
+            }
         )
         binary += a.tobytes() + b"\0" * (-a.nbytes % 4)
     primitive: dict = {"attributes": {n: k for k, n in enumerate(attributes)}}
@@ -61,13 +75,17 @@ def test_a_mesh_without_normals_is_flat(tmp_path: Path) -> None:
     np.testing.assert_array_equal(mesh.uvs[mesh.faces], uvs[faces])
     p = positions[faces].astype(np.float64)
     own = unit(np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]))
-    np.testing.assert_allclose(mesh.normals[mesh.faces], np.repeat(own[:, None], 3, axis=1), atol=1e-6)
+    np.testing.assert_allclose(
+        mesh.normals[mesh.faces], np.repeat(own[:, None], 3, axis=1), atol=1e-6
+    )
     assert any("flat" in n for n in asset.notes)
 
 
 def test_corners_of_one_plane_go_on_sharing_their_vertices(tmp_path: Path) -> None:
     box = trimesh.creation.box()
-    write_glb(tmp_path / "x.glb", *document({"POSITION": box.vertices.astype(np.float32)}, box.faces))
+    write_glb(
+        tmp_path / "x.glb", *document({"POSITION": box.vertices.astype(np.float32)}, box.faces)
+    )
     mesh = load(tmp_path / "x.glb").meshes[0]
     assert len(mesh.faces) == 12
     assert len(np.unique(np.concatenate([mesh.positions, mesh.normals], axis=1), axis=0)) == 24
@@ -98,11 +116,15 @@ def test_flat_triangles_stay_connected_in_decimation(tmp_path: Path) -> None:
     assert 90 < len(f) <= 100
     assert trimesh.Trimesh(p, f, process=False).is_watertight
     assert len(f) == len(same)
-    assert np.abs(np.linalg.norm(p, axis=1) - 1).max() < np.abs(np.linalg.norm(expected, axis=1) - 1).max() + 0.02
+    assert (
+        np.abs(np.linalg.norm(p, axis=1) - 1).max()
+        < np.abs(np.linalg.norm(expected, axis=1) - 1).max() + 0.02
+    )
 
 
 def test_a_mesh_to_bake_onto_keeps_its_vertices_and_coordinates(tmp_path: Path) -> None:
-    """To the last bit, whatever transform its old material has; a texture that would need it is noted."""
+    """To the last bit, whatever transform its old material has; a texture that would need it is
+    noted."""
     positions, faces = ball(1)
     uvs = np.random.default_rng(0).random((len(positions), 2)).astype(np.float32)
     (tmp_path / "t.png").write_bytes(images.encode_png(np.zeros((2, 2, 3), np.uint8)))
@@ -122,11 +144,15 @@ def test_a_mesh_to_bake_onto_keeps_its_vertices_and_coordinates(tmp_path: Path) 
     np.testing.assert_array_equal(mesh.faces, faces)
     np.testing.assert_array_equal(mesh.uvs, uvs)
     assert mesh.normals is None
-    assert any("material 'old'" in n and "base color" in n and "not applied" in n for n in asset.notes)
+    assert any(
+        "material 'old'" in n and "base color" in n and "not applied" in n for n in asset.notes
+    )
     np.testing.assert_allclose(load(tmp_path / "x.glb").meshes[0].uvs.max(), 4 * uvs.max())
 
 
-SHIFT = np.array([[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [5, 0, 0, 1]], np.float32)  # columns, as glTF stores them
+SHIFT = np.array(
+    [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [5, 0, 0, 1]], np.float32
+)  # columns, as glTF stores them
 
 
 def skinned(tmp_path: Path, weights: np.ndarray, joints: list[dict], inverse: np.ndarray) -> Mesh:
@@ -155,7 +181,8 @@ def skinned(tmp_path: Path, weights: np.ndarray, joints: list[dict], inverse: np
 
 
 def test_skinned_meshes_are_where_their_joints_are(tmp_path: Path) -> None:
-    """By hand: joints at 2 (1, 0, 0) and 2 (0, 0, 3); the second one's inverse bind matrix moves by (5, 0, 0)."""
+    """By hand: joints at 2 (1, 0, 0) and 2 (0, 0, 3); the second one's inverse bind matrix moves by
+    (5, 0, 0)."""
     weights = np.array([[1, 0, 0, 0], [0, 1, 0, 0], [0.5, 0.5, 0, 0]])
     joints = [{"translation": [1, 0, 0]}, {"translation": [0, 0, 3]}]
     mesh = skinned(tmp_path, weights, joints, np.stack([np.eye(4, dtype=np.float32), SHIFT]))
@@ -166,7 +193,9 @@ def test_skinned_meshes_are_where_their_joints_are(tmp_path: Path) -> None:
 
 
 def test_skins_turn_normals_and_tangents(tmp_path: Path) -> None:
-    turn = {"rotation": [0, np.sqrt(0.5), 0, np.sqrt(0.5)]}  # a quarter around y: z becomes x, x becomes -z
+    turn = {
+        "rotation": [0, np.sqrt(0.5), 0, np.sqrt(0.5)]
+    }  # a quarter around y: z becomes x, x becomes -z
     weights = np.tile([0.25, 0.25, 0, 0], (3, 1))  # not normalised
     mesh = skinned(tmp_path, weights, [turn, turn], np.stack([np.eye(4, dtype=np.float32)] * 2))
     np.testing.assert_allclose(mesh.positions[:, 2].min(), -2, atol=1e-6)
@@ -179,11 +208,17 @@ def test_a_joint_that_does_not_exist_is_refused(tmp_path: Path) -> None:
         skinned(tmp_path, np.eye(3, 4), [{}], np.stack([SHIFT] * 2))
 
 
-@pytest.mark.parametrize("scale", [(-2.0, 1.0, 1.0), (1.0, 1.0, -1.0), (-1.0, -1.0, 1.0), (1.0, 1.0, 1.0)])
-def test_tangents_of_mirrored_nodes_are_those_of_the_mirrored_mesh(tmp_path: Path, scale: tuple) -> None:
+@pytest.mark.parametrize(
+    "scale", [(-2.0, 1.0, 1.0), (1.0, 1.0, -1.0), (-1.0, -1.0, 1.0), (1.0, 1.0, 1.0)]
+)
+def test_tangents_of_mirrored_nodes_are_those_of_the_mirrored_mesh(
+    tmp_path: Path, scale: tuple
+) -> None:
     """Against our own MikkTSpace on what was loaded."""
     positions, faces = ball(2)
-    uvs = np.stack([np.arctan2(positions[:, 0], 3 + positions[:, 2]), positions[:, 1]], axis=1).astype(np.float32)
+    uvs = np.stack(
+        [np.arctan2(positions[:, 0], 3 + positions[:, 2]), positions[:, 1]], axis=1
+    ).astype(np.float32)
     normals = vertex_normals(positions, faces)
     index, new, tangents = split_and_tangents(positions, normals, uvs, faces)
     given = {
@@ -194,7 +229,8 @@ def test_tangents_of_mirrored_nodes_are_those_of_the_mirrored_mesh(tmp_path: Pat
     mesh = load(tmp_path / "x.glb").meshes[0]
     again, _, expected = split_and_tangents(mesh.positions, mesh.normals, mesh.uvs, mesh.faces)
     np.testing.assert_array_equal(mesh.tangents[again, 3], expected[:, 3])
-    # a scale that is not the same in all directions does not commute with the angles that weight tangents
+    # a scale that is not the same in all directions does not commute with the angles that weight
+    # tangents
     cosine = np.sum(mesh.tangents[again, :3] * expected[:, :3], axis=1)
     assert np.quantile(cosine, 0.02) > (0.9999 if len({abs(s) for s in scale}) == 1 else 0.98)
 
@@ -202,7 +238,9 @@ def test_tangents_of_mirrored_nodes_are_those_of_the_mirrored_mesh(tmp_path: Pat
 def test_instances(tmp_path: Path) -> None:
     """EXT_mesh_gpu_instancing: the node's transform after the instance's."""
     translation = np.array([[1, 0, 0], [0, 5, 0]], np.float32)
-    rotation = np.array([[0, 0, 0, 1], [0, 0, 1, 0]], np.float32)  # the second one by half a turn around z
+    rotation = np.array(
+        [[0, 0, 0, 1], [0, 0, 1, 0]], np.float32
+    )  # the second one by half a turn around z
     scale = np.array([[1, 1, 1], [3, 3, 3]], np.float32)
     positions = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], np.float32)
     attributes = {"TRANSLATION": 1, "ROTATION": 2, "SCALE": 3}
@@ -226,8 +264,14 @@ def test_instances(tmp_path: Path) -> None:
 
 
 def test_extensions_that_a_file_requires(tmp_path: Path) -> None:
-    for name, fine in (("KHR_materials_clearcoat", True), ("KHR_lights_punctual", True), ("ACME_voxels", False)):
-        write_glb(tmp_path / "x.glb", *triangle_document(extensionsUsed=[name], extensionsRequired=[name]))
+    for name, fine in (
+        ("KHR_materials_clearcoat", True),
+        ("KHR_lights_punctual", True),
+        ("ACME_voxels", False),
+    ):
+        write_glb(
+            tmp_path / "x.glb", *triangle_document(extensionsUsed=[name], extensionsRequired=[name])
+        )
         if fine:
             assert f"extension {name} ignored" in load(tmp_path / "x.glb").notes
         else:
@@ -245,6 +289,8 @@ def test_morph_targets_are_noted(tmp_path: Path) -> None:
 def test_what_was_written_without_normals_is_read_flat(tmp_path: Path) -> None:
     positions, faces = ball(1)
     texture = Texture(np.full((2, 2, 3), 9, np.uint8), "srgb")
-    mesh = Mesh(positions, faces, uvs=positions[:, :2].copy(), material=Material(base_color_texture=texture))
+    mesh = Mesh(
+        positions, faces, uvs=positions[:, :2].copy(), material=Material(base_color_texture=texture)
+    )
     save(Asset((replace(mesh, name="m"),)), tmp_path / "x.glb")
     assert len(load(tmp_path / "x.glb").meshes[0].positions) == 3 * len(faces)

@@ -1,4 +1,5 @@
-"""A mesh that is baked onto keeps its vertices and texture coordinates, in every format and in ``bake``."""
+"""A mesh that is baked onto keeps its vertices and texture coordinates, in every format and in
+``bake``."""
 
 from __future__ import annotations
 
@@ -52,10 +53,14 @@ def test_without_transforms_nothing_changes(tmp_path: Path, ball: Asset, suffix:
 def test_an_obj_file_s_scale_is_not_applied(tmp_path: Path) -> None:
     (tmp_path / "t.png").write_bytes(images.encode_png(np.zeros((2, 2, 3), np.uint8)))
     (tmp_path / "x.mtl").write_text("newmtl m\nmap_Kd -s 4 4 t.png\n")
-    text = "mtllib x.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\nusemtl m\nf 1/1 2/2 3/3\n"
+    text = (
+        "mtllib x.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\nusemtl m\nf 1/1 2/2 3/3\n"
+    )
     (tmp_path / "x.obj").write_text(text)
     asset = load(tmp_path / "x.obj", keep_layout=True)
     assert asset.meshes[0].uvs.max() == 1
     assert any("not applied" in n for n in asset.notes)
     moved = load(tmp_path / "x.obj").meshes[0].uvs
-    np.testing.assert_array_equal([moved.min(), moved.max()], [-3, 4])  # v is counted from the top: 1 - 4 * 1
+    np.testing.assert_array_equal(
+        [moved.min(), moved.max()], [-3, 4]
+    )  # v is counted from the top: 1 - 4 * 1

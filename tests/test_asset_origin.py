@@ -34,9 +34,13 @@ def small() -> tuple[np.ndarray, np.ndarray]:
 
 
 def corners(asset: Asset) -> np.ndarray:
-    """(N, 3) corners of all triangles in the world, in double precision, in the order of the faces."""
+    """(N, 3) corners of all triangles in the world, in double precision, in the order of the
+    faces."""
     meshes = asset.meshes
-    return np.concatenate([m.positions.astype(np.float64)[m.faces].reshape(-1, 3) for m in meshes]) + asset.origin
+    return (
+        np.concatenate([m.positions.astype(np.float64)[m.faces].reshape(-1, 3) for m in meshes])
+        + asset.origin
+    )
 
 
 def write(folder: Path, kind: str, place: np.ndarray = PLACE) -> Path:
@@ -47,7 +51,10 @@ def write(folder: Path, kind: str, place: np.ndarray = PLACE) -> Path:
     rows = [f"{x:.9f} {y:.9f} {z:.9f}" for x, y, z in world.tolist()]
     if kind == "glb":
         given, binary = document({"POSITION": positions, "NORMAL": positions * 4}, faces)
-        given["nodes"] = [{"children": [1], "translation": (place - 7).tolist()}, {"mesh": 0, "translation": [7, 7, 7]}]
+        given["nodes"] = [
+            {"children": [1], "translation": (place - 7).tolist()},
+            {"mesh": 0, "translation": [7, 7, 7]},
+        ]
         write_glb(path, given, binary)
     elif kind == "obj":
         used = [f"f {a + 1} {b + 1} {c + 1}" for a, b, c in faces.tolist()]
@@ -55,7 +62,13 @@ def write(folder: Path, kind: str, place: np.ndarray = PLACE) -> Path:
     elif kind == "stl":
         lines = ["solid x"]
         for face in faces.tolist():
-            lines += ["facet normal 0 0 0", "outer loop", *(f"vertex {rows[i]}" for i in face), "endloop", "endfacet"]
+            lines += [
+                "facet normal 0 0 0",
+                "outer loop",
+                *(f"vertex {rows[i]}" for i in face),
+                "endloop",
+                "endfacet",
+            ]
         path.write_text("\n".join([*lines, "endsolid x"]) + "\n")
     elif kind == "usda":
         points = ", ".join(f"({x!r}, {y!r}, {z!r})" for x, y, z in positions.tolist())
@@ -79,7 +92,9 @@ def write(folder: Path, kind: str, place: np.ndarray = PLACE) -> Path:
             path.write_text(head.format("ascii") + body + "\n")
         else:
             body = b"".join(struct.pack("<B3i", 3, *face) for face in faces.tolist())
-            path.write_bytes(head.format("binary_little_endian").encode() + world.astype("<f8").tobytes() + body)
+            path.write_bytes(
+                head.format("binary_little_endian").encode() + world.astype("<f8").tobytes() + body
+            )
     return path
 
 
@@ -89,8 +104,11 @@ def test_detail_at_map_coordinates_is_kept(tmp_path: Path, kind: str) -> None:
     positions, faces = small()
     assert any(asset.origin)
     assert max(np.abs(m.positions).max() for m in asset.meshes) < 1
-    # text has nine decimals; a double has steps of 0.5 nm here, a hundredth of which counts in centimetres
-    np.testing.assert_allclose(corners(asset), positions[faces].reshape(-1, 3) + PLACE, atol=0.01 * MICROMETRE)
+    # text has nine decimals; a double has steps of 0.5 nm here, a hundredth of which counts in
+    # centimetres
+    np.testing.assert_allclose(
+        corners(asset), positions[faces].reshape(-1, 3) + PLACE, atol=0.01 * MICROMETRE
+    )
     assert not any("degenerate" in note for note in asset.notes)
     assert any("far from the origin" in note for note in asset.notes)
     for part in asset.origin:
@@ -117,7 +135,11 @@ def test_only_what_faces_use_says_how_far_away_it_is() -> None:
     meshes, origin = settle([Mesh(stray, faces), Mesh(stray[:0], faces[:0])], notes.append)  # type: ignore[arg-type]
     np.testing.assert_allclose(origin, PLACE, atol=0.25)
     assert meshes[0].positions.dtype == np.float32
-    for rows, used in ((np.zeros((3, 3)), faces[:1]), (np.full((3, 3), np.inf), faces[:1]), (stray[:0], faces)):
+    for rows, used in (
+        (np.zeros((3, 3)), faces[:1]),
+        (np.full((3, 3), np.inf), faces[:1]),
+        (stray[:0], faces),
+    ):
         assert settle([Mesh(rows, used)], notes.append)[1] == (0, 0, 0)  # type: ignore[arg-type]
 
 
@@ -163,7 +185,9 @@ def test_assets_of_different_origins_are_compared_where_they_are() -> None:
     moved = compare(first, apart(first, PLACE), views=1, resolution=16, samples=1).notes
     assert not any("apart" in note for note in moved)
     elsewhere = replace(first, origin=tuple((PLACE - (30, 0, 0)).tolist()))
-    assert any("30 m apart" in note for note in compare(first, elsewhere, views=2, resolution=64).notes)
+    assert any(
+        "30 m apart" in note for note in compare(first, elsewhere, views=2, resolution=64).notes
+    )
     with pytest.raises(InputError, match=r"m apart, .* move one of them"):
         compare(first, replace(first, origin=(0, 0, 0)), views=1, resolution=16)
 
@@ -189,13 +213,26 @@ def test_a_result_lies_where_the_input_does(tmp_path: Path) -> None:
     bumpy = (near.meshes[0].positions * bumps[first][place] * (1, 1.3, 0.8)).astype(np.float32)
     near = replace(near, meshes=(replace(near.meshes[0], positions=bumpy),))
     far = replace(near, origin=tuple(PLACE))
-    given = {"steps": 0, "texture_size": 32, "resolution": 32, "pool": 4, "reallocate": 0, "views": 2}
-    results = [simplify(a, None, simplify_options("draft", triangles=60, **given)) for a in (near, far)]
+    given = {
+        "steps": 0,
+        "texture_size": 32,
+        "resolution": 32,
+        "pool": 4,
+        "reallocate": 0,
+        "views": 2,
+    }
+    results = [
+        simplify(a, None, simplify_options("draft", triangles=60, **given)) for a in (near, far)
+    ]
     a, b = (r.asset for r in results)
     assert b.origin == far.origin
     np.testing.assert_allclose(b.meshes[0].positions, a.meshes[0].positions, atol=1e-5)
     save(apart(b, PLACE + (4, 0, 0)), tmp_path / "low.glb")
-    again = simplify(far, tmp_path / "again.glb", simplify_options("draft", init=str(tmp_path / "low.glb"), **given))
+    again = simplify(
+        far,
+        tmp_path / "again.glb",
+        simplify_options("draft", init=str(tmp_path / "low.glb"), **given),
+    )
     assert again.asset.origin == far.origin
     low, high = load(tmp_path / "again.glb").bounds()
     np.testing.assert_allclose((low + high) / 2, PLACE, atol=0.1)

@@ -89,25 +89,40 @@ def test_round_trip_through_every_writer(tmp_path: Path, ball: Asset, suffix: st
     before, after = mesh.positions[mesh.faces], again.positions[again.faces]
     np.testing.assert_allclose(after, before, atol=1e-7)
     np.testing.assert_allclose(again.uvs[again.faces], mesh.uvs[mesh.faces], atol=1e-6)
-    np.testing.assert_array_equal(again.material.base_color_texture.pixels, mesh.material.base_color_texture.pixels)
-    np.testing.assert_array_equal(again.material.orm_texture.pixels[..., 1:], mesh.material.orm_texture.pixels[..., 1:])
+    np.testing.assert_array_equal(
+        again.material.base_color_texture.pixels, mesh.material.base_color_texture.pixels
+    )
+    np.testing.assert_array_equal(
+        again.material.orm_texture.pixels[..., 1:], mesh.material.orm_texture.pixels[..., 1:]
+    )
     assert {p.name for p in tmp_path.iterdir() if p.name.startswith(".")} == set()
 
 
 @pytest.mark.parametrize("suffix", [".obj", ".glb", ".usda"])
-def test_meshes_that_do_not_have_the_same_attributes(tmp_path: Path, ball: Asset, suffix: str) -> None:
-    """One without texture coordinates, one without normals, one with neither, before one with both."""
+def test_meshes_that_do_not_have_the_same_attributes(
+    tmp_path: Path, ball: Asset, suffix: str
+) -> None:
+    """One without texture coordinates, one without normals, one with neither, before one with
+    both."""
     mesh = ball.meshes[0]
-    bare = [replace(mesh, uvs=None), replace(mesh, normals=None), replace(mesh, uvs=None, normals=None), mesh]
+    bare = [
+        replace(mesh, uvs=None),
+        replace(mesh, normals=None),
+        replace(mesh, uvs=None, normals=None),
+        mesh,
+    ]
     save(
-        Asset(tuple(replace(m, tangents=None, name=f"m{k}") for k, m in enumerate(bare)), "x"), tmp_path / f"x{suffix}"
+        Asset(tuple(replace(m, tangents=None, name=f"m{k}") for k, m in enumerate(bare)), "x"),
+        tmp_path / f"x{suffix}",
     )
     again = load(tmp_path / f"x{suffix}").meshes
     assert len(again) == 4
     # normals that a format lacks are computed
     assert [(m.uvs is not None) for m in again].count(True) == 2
     for m in again:
-        np.testing.assert_allclose(np.ptp(m.positions, axis=0), np.ptp(mesh.positions[mesh.faces.ravel()], axis=0))
+        np.testing.assert_allclose(
+            np.ptp(m.positions, axis=0), np.ptp(mesh.positions[mesh.faces.ravel()], axis=0)
+        )
         if m.uvs is not None:
             np.testing.assert_allclose(
                 np.sort(m.uvs[m.faces].ravel()), np.sort(mesh.uvs[mesh.faces].ravel()), atol=1e-6
@@ -130,7 +145,9 @@ def test_a_root_allows_files_outside_of_the_own_folder(tmp_path: Path, ball: Ass
         (tmp_path / name).mkdir()
     save(ball, tmp_path / "library" / "ball.usda")
     scene = tmp_path / "shot" / "scene.usda"
-    scene.write_text('#usda 1.0\n(metersPerUnit = 1\nupAxis = "Y"\nsubLayers = [@../library/ball.usda@])\n')
+    scene.write_text(
+        '#usda 1.0\n(metersPerUnit = 1\nupAxis = "Y"\nsubLayers = [@../library/ball.usda@])\n'
+    )
     with pytest.raises(InputError, match=r"outside its own folder.*--root"):
         load(scene)
     with pytest.raises(InputError, match="no such folder"):
@@ -165,7 +182,9 @@ def test_normals_that_an_obj_file_does_not_have_are_ignored(tmp_path: Path) -> N
 
 def test_tga_textures_in_memory(tmp_path: Path) -> None:
     pixels = np.array([[(255, 0, 0), (0, 255, 0)], [(0, 0, 255), (9, 8, 7)]], np.uint8)
-    head = bytes([0, 0, 2, 0, 0, 0, 0, 0, 0, 0, 0, 0, 2, 0, 2, 0, 24, 0x20])  # uncompressed, rows from the top
+    head = bytes(
+        [0, 0, 2, 0, 0, 0, 0, 0, 0, 0, 0, 0, 2, 0, 2, 0, 24, 0x20]
+    )  # uncompressed, rows from the top
     np.testing.assert_array_equal(images.decode(head + pixels[..., ::-1].tobytes(), "x"), pixels)
 
 
@@ -208,7 +227,8 @@ def test_catmull_clark_of_a_cube_tends_to_its_known_limit() -> None:
     values, polygons = corners, Polygons(np.full(6, 4), np.array(quads))
     values, polygons, _ = catmull_clark(values, polygons, False)
     assert (len(values), len(polygons.counts)) == (8 + 12 + 6, 24)
-    # first level by hand: corner (F + 2R + 0 V) / 3 with F, R the means of face points and edge middles
+    # first level by hand: corner (F + 2R + 0 V) / 3 with F, R the means of face points and edge
+    # middles
     np.testing.assert_allclose(np.abs(values[:8]), 5 / 9, atol=1e-12)
     np.testing.assert_allclose(sorted(np.abs(values[8])), [0, 0.75, 0.75], atol=1e-12)
 
@@ -237,7 +257,9 @@ def test_usd_output_passes_usd_validation(tmp_path: Path, ball: Asset) -> None:
     stage = usd.Stage.Open(str(tmp_path / "x.usda"))
     registry = validation.ValidationRegistry()
     context = validation.ValidationContext(registry.GetOrLoadAllValidators())
-    errors = [e for e in context.Validate(stage) if e.GetType() == validation.ValidationErrorType.Error]
+    errors = [
+        e for e in context.Validate(stage) if e.GetType() == validation.ValidationErrorType.Error
+    ]
     assert not errors, [e.GetMessage() for e in errors]
 
 

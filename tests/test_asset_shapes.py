@@ -1,4 +1,5 @@
-"""What of a file's shapes is drawn: default morph weights, scenes and their roots, holes, opacity."""
+"""What of a file's shapes is drawn: default morph weights, scenes and their roots, holes,
+opacity."""
 
 from __future__ import annotations
 
@@ -18,11 +19,16 @@ from tests.test_asset_gltf import triangle_document, write_glb
 from tests.test_asset_gltf_nodes import ball, document
 
 
-def sparse(given: dict, binary: bytes, count: int, where: np.ndarray, values: np.ndarray) -> tuple[dict, bytes, int]:
-    """The document with one accessor more: zeros, but for ``values`` (N, 3) at the indices ``where`` (N,)."""
+def sparse(
+    given: dict, binary: bytes, count: int, where: np.ndarray, values: np.ndarray
+) -> tuple[dict, bytes, int]:
+    """The document with one accessor more: zeros, but for ``values`` (N, 3) at the indices
+    ``where`` (N,)."""
     first = len(given["bufferViews"])
     for data in (where.astype(np.uint32), values.astype(np.float32)):
-        given["bufferViews"].append({"buffer": 0, "byteOffset": len(binary), "byteLength": data.nbytes})
+        given["bufferViews"].append(
+            {"buffer": 0, "byteOffset": len(binary), "byteLength": data.nbytes}
+        )
         binary += data.tobytes()
     given["buffers"][0]["byteLength"] = len(binary)
     indices = {"bufferView": first, "componentType": 5125}
@@ -31,7 +37,11 @@ def sparse(given: dict, binary: bytes, count: int, where: np.ndarray, values: np
             "componentType": 5126,
             "count": count,
             "type": "VEC3",
-            "sparse": {"count": len(where), "indices": indices, "values": {"bufferView": first + 1}},
+            "sparse": {
+                "count": len(where),
+                "indices": indices,
+                "values": {"bufferView": first + 1},
+            },
         }
     )
     return given, binary, len(given["accessors"]) - 1
@@ -72,7 +82,9 @@ def test_flat_normals_are_those_of_the_morphed_shape(tmp_path: Path) -> None:
     given, binary, _ = sparse(given, binary, 3, np.array([1]), np.array([[0.0, 0, 1]]))
     write_glb(tmp_path / "x.glb", given, binary)
     mesh = load(tmp_path / "x.glb").meshes[0]
-    np.testing.assert_allclose(mesh.normals, np.tile(unit(np.array([-1.0, 0, 1])), (3, 1)), atol=1e-6)
+    np.testing.assert_allclose(
+        mesh.normals, np.tile(unit(np.array([-1.0, 0, 1])), (3, 1)), atol=1e-6
+    )
 
 
 def test_a_morph_target_of_another_length_is_refused(tmp_path: Path) -> None:
@@ -86,7 +98,9 @@ def test_a_morph_target_of_another_length_is_refused(tmp_path: Path) -> None:
 
 
 def test_without_scenes_every_mesh_is_drawn_once(tmp_path: Path) -> None:
-    given, binary = triangle_document(nodes=[{"mesh": 0}, {"children": [0], "translation": [5, 0, 0]}, {"mesh": 0}])
+    given, binary = triangle_document(
+        nodes=[{"mesh": 0}, {"children": [0], "translation": [5, 0, 0]}, {"mesh": 0}]
+    )
     del given["scenes"], given["scene"]
     write_glb(tmp_path / "x.glb", given, binary)
     meshes = load(tmp_path / "x.glb").meshes
@@ -94,7 +108,9 @@ def test_without_scenes_every_mesh_is_drawn_once(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("given", "taken", "place"), [({}, "left", 0), ({"scene": 1}, "right", 5)])
-def test_the_scene_that_is_taken_is_named(tmp_path: Path, given: dict, taken: str, place: int) -> None:
+def test_the_scene_that_is_taken_is_named(
+    tmp_path: Path, given: dict, taken: str, place: int
+) -> None:
     changed, binary = triangle_document(
         nodes=[{"mesh": 0}, {"mesh": 0, "translation": [5, 0, 0]}],
         scenes=[{"nodes": [0], "name": "left"}, {"nodes": [1], "name": "right"}],
@@ -117,7 +133,9 @@ SQUARES = (
 def usd(folder: Path, text: str, more: str = "", **options: object) -> Asset:
     """A stage with one mesh of these squares."""
     path = folder / "x.usda"
-    path.write_text(f'#usda 1.0\n(upAxis = "Y"\nmetersPerUnit = 1)\n{more}def Mesh "m"\n{{\n{SQUARES}{text}\n}}\n')
+    path.write_text(
+        f'#usda 1.0\n(upAxis = "Y"\nmetersPerUnit = 1)\n{more}def Mesh "m"\n{{\n{SQUARES}{text}\n}}\n'
+    )
     return load(path, **options)  # type: ignore[arg-type]
 
 
@@ -136,8 +154,12 @@ FOLDED = np.array([[0, 0, 1], [-(0.5**0.5), 0, 0.5**0.5]])
 
 
 @pytest.mark.parametrize("scheme", ["none", "bilinear"])
-@pytest.mark.parametrize(("more", "sign"), [("", 1), ('uniform token orientation = "leftHanded"', -1)])
-def test_a_polygonal_mesh_without_normals_is_faceted(tmp_path: Path, scheme: str, more: str, sign: int) -> None:
+@pytest.mark.parametrize(
+    ("more", "sign"), [("", 1), ('uniform token orientation = "leftHanded"', -1)]
+)
+def test_a_polygonal_mesh_without_normals_is_faceted(
+    tmp_path: Path, scheme: str, more: str, sign: int
+) -> None:
     mesh = usd(tmp_path, f'uniform token subdivisionScheme = "{scheme}"\n{more}').meshes[0]
     np.testing.assert_allclose(mesh.normals[mesh.faces[::2, 0]], sign * FOLDED, atol=1e-6)
     np.testing.assert_allclose(mesh.normals[mesh.faces[1::2, 0]], sign * FOLDED, atol=1e-6)
@@ -175,7 +197,10 @@ READER = """def Material "glass"
 
 @pytest.mark.parametrize(
     ("how", "values", "alpha"),
-    [("constant", "[0.25]", [0.25] * 6), ("vertex", "[0, 0.2, 0.4, 0.6, 0.8, 1]", [0, 0.2, 0.4, 0.6, 0.8, 1])],
+    [
+        ("constant", "[0.25]", [0.25] * 6),
+        ("vertex", "[0, 0.2, 0.4, 0.6, 0.8, 1]", [0, 0.2, 0.4, 0.6, 0.8, 1]),
+    ],
 )
 @pytest.mark.parametrize(("bound", "mode"), [(None, "blend"), ("0", "blend"), ("0.5", "mask")])
 def test_display_opacity_is_kept(
@@ -190,7 +215,10 @@ def test_display_opacity_is_kept(
         mesh = again.meshes[0]
         assert mesh.material.alpha_mode == mode
         assert mesh.colors is not None
-        got = {tuple(p): a for p, a in zip(mesh.positions.tolist(), mesh.colors[:, 3].tolist(), strict=True)}
+        got = {
+            tuple(p): a
+            for p, a in zip(mesh.positions.tolist(), mesh.colors[:, 3].tolist(), strict=True)
+        }
         points = [(0, 0, 0), (1, 0, 0), (2, 0, 1), (0, 1, 0), (1, 1, 0), (2, 1, 1)]
         np.testing.assert_allclose([got[p] for p in points], alpha, atol=1e-6)
 
@@ -274,6 +302,8 @@ def test_default_weights_of_blend_shapes_are_part_of_the_shape(tmp_path: Path, h
     tilted = np.array([1, 0, 1]) / 2**0.5
     np.testing.assert_allclose(mesh.normals[corner], [[0, 0, 1], tilted, [0, 0, 1]], atol=1e-6)
     assert any("default weights" in note for note in asset.notes)
-    path.write_text(FACE.replace("HOW", how).replace("float[] blendShapeWeights = [0.5, 3, 0.25]", ""))
+    path.write_text(
+        FACE.replace("HOW", how).replace("float[] blendShapeWeights = [0.5, 3, 0.25]", "")
+    )
     mesh = load(path).meshes[0]
     np.testing.assert_allclose(mesh.positions[mesh.faces[0]], [[0, 0, 0], [1, 0, 0], [0, 1, 0]])

@@ -20,11 +20,36 @@ from appearance_opt.errors import InputError
 from tests.conftest import make_asset
 from tests.test_asset_gltf import triangle_document, write_glb
 
-ROOTS = ("x.glb", "x.gltf", "x.bin", "x_0.png", "x.obj", "x.mtl", "x.usda", "x.usdc", "x.usdz", "x.ply", "x.stl")
+ROOTS = (
+    "x.glb",
+    "x.gltf",
+    "x.bin",
+    "x_0.png",
+    "x.obj",
+    "x.mtl",
+    "x.usda",
+    "x.usdc",
+    "x.usdz",
+    "x.ply",
+    "x.stl",
+)
 OWNERS = {"x.bin": "x.gltf", "x_0.png": "x.gltf", "x.mtl": "x.obj"}
 """Which file to load when another one is damaged."""
 
-NUMBERS = (b"-1", b"0", b"1e999", b"nan", b"9" * 23, b"2147483648", b"1e30", b"null", b'"x"', b"[]", b"{}", b"-0.5")
+NUMBERS = (
+    b"-1",
+    b"0",
+    b"1e999",
+    b"nan",
+    b"9" * 23,
+    b"2147483648",
+    b"1e30",
+    b"null",
+    b'"x"',
+    b"[]",
+    b"{}",
+    b"-0.5",
+)
 """What numbers in text formats are replaced by."""
 
 
@@ -42,7 +67,9 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def damaged(data: bytes, cut: float, changes: list[tuple[float, int]], number: tuple[float, int]) -> bytes:
+def damaged(
+    data: bytes, cut: float, changes: list[tuple[float, int]], number: tuple[float, int]
+) -> bytes:
     """Bytes cut to a share of their length, some of them changed, one decimal number replaced."""
     out = bytearray(data[: max(int(cut * len(data)), 0)])
     for at, value in changes:
@@ -56,7 +83,8 @@ def damaged(data: bytes, cut: float, changes: list[tuple[float, int]], number: t
     return bytes(out)
 
 
-# (what fraction to keep, bytes to change, a number to replace): most examples damage in one way only
+# (what fraction to keep, bytes to change, a number to replace): most examples damage in one way
+# only
 damages = st.one_of(
     st.tuples(st.floats(0, 1, exclude_max=True), st.just([]), st.just((0.0, len(NUMBERS)))),
     st.tuples(
@@ -64,7 +92,9 @@ damages = st.one_of(
         st.lists(st.tuples(st.floats(0, 1), st.integers(0, 255)), min_size=1, max_size=6),
         st.just((0.0, len(NUMBERS))),
     ),
-    st.tuples(st.just(1.0), st.just([]), st.tuples(st.floats(0, 1), st.integers(0, len(NUMBERS) - 1))),
+    st.tuples(
+        st.just(1.0), st.just([]), st.tuples(st.floats(0, 1), st.integers(0, len(NUMBERS) - 1))
+    ),
 )
 
 
@@ -82,7 +112,9 @@ def test_damage_to_any_file_is_refused_or_harmless(whole: Path, name: str, damag
             assert mesh.faces.min() >= 0 and mesh.faces.max() < len(mesh.positions)
     except InputError as error:
         assert "\n" not in str(error)
-        assert "x" in str(error) and len(str(error)) < 600  # measured: at most 340 with the folder's name
+        assert (
+            "x" in str(error) and len(str(error)) < 600
+        )  # measured: at most 340 with the folder's name
     finally:
         (whole / name).write_bytes(original)
 
@@ -102,7 +134,9 @@ def test_damaged_pictures(damage: tuple, kind: str) -> None:
 def test_a_damaged_picture_prints_nothing_of_its_own(capfd: pytest.CaptureFixture) -> None:
     data = bytearray(images.encode_png(np.zeros((9, 7, 3), np.uint8)))
     data[60] ^= 255
-    with pytest.raises(InputError, match="the image is damaged"):  # how, depends on the version of OpenImageIO
+    with pytest.raises(
+        InputError, match="the image is damaged"
+    ):  # how, depends on the version of OpenImageIO
         images.decode(bytes(data), "picture")
     with pytest.raises(InputError, match="cut short"):
         images.decode(bytes(data[:30]), "picture")
@@ -122,7 +156,10 @@ def test_textures_of_extreme_shapes_load(tmp_path: Path, ball: Asset) -> None:
         pixels = np.full((*shape, 3), 200, np.uint8)
         material = replace(ball.meshes[0].material, base_color_texture=Texture(pixels, "srgb"))
         save(Asset((replace(ball.meshes[0], material=material),)), tmp_path / "x.glb")
-        assert load(tmp_path / "x.glb").meshes[0].material.base_color_texture.pixels.shape == (*shape, 3)
+        assert load(tmp_path / "x.glb").meshes[0].material.base_color_texture.pixels.shape == (
+            *shape,
+            3,
+        )
     with pytest.raises(InputError, match="at most 16384"):
         images.decode(images.encode_png(np.zeros((1, 16385, 3), np.uint8)), "too wide")
 
@@ -130,8 +167,18 @@ def test_textures_of_extreme_shapes_load(tmp_path: Path, ball: Asset) -> None:
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"accessors": [{"componentType": 5126, "count": 10**12, "type": "VEC3"}]}, "elements but no data"),
-        ({"accessors": [{"bufferView": 0, "componentType": 5126, "count": 10**12, "type": "VEC3"}]}, "beyond"),
+        (
+            {"accessors": [{"componentType": 5126, "count": 10**12, "type": "VEC3"}]},
+            "elements but no data",
+        ),
+        (
+            {
+                "accessors": [
+                    {"bufferView": 0, "componentType": 5126, "count": 10**12, "type": "VEC3"}
+                ]
+            },
+            "beyond",
+        ),
         ({"buffers": [{"byteLength": 36, "uri": "a" * 5000}]}, "no file name"),
         ({"buffers": [{"byteLength": 36, "uri": "%2e%2e/secret.bin"}]}, "outside"),
         ({"buffers": [{"byteLength": 36, "uri": "link.bin"}]}, "outside"),
@@ -157,7 +204,9 @@ def test_deeply_nested_json_is_refused(tmp_path: Path) -> None:
         load(tmp_path / "x.gltf")
 
 
-@pytest.mark.parametrize("reference", ["../secret.png", "/etc/hostname", "C:/x.png", "http://a/b.png", "absent.png"])
+@pytest.mark.parametrize(
+    "reference", ["../secret.png", "/etc/hostname", "C:/x.png", "http://a/b.png", "absent.png"]
+)
 def test_mtl_references_stay_in_the_folder(tmp_path: Path, reference: str) -> None:
     folder = tmp_path / "asset"
     folder.mkdir()
@@ -199,8 +248,8 @@ def test_obj_with_impossible_numbers(tmp_path: Path, text: str, words: str) -> N
 
 
 def test_binary_usd_that_crashes_usd_itself_is_refused(tmp_path: Path) -> None:
-    """A count among the values, which nothing but USD can check: without the guard this process would end here with
-    a segmentation fault."""
+    """A count among the values, which nothing but USD can check: without the guard this process
+    would end here with a segmentation fault."""
     save(make_asset(4, 6, 8), tmp_path / "x.usdc")
     data = bytearray((tmp_path / "x.usdc").read_bytes())
     assert data[88:96] == struct.pack("<Q", 1)  # length of the first list of the file
@@ -230,7 +279,11 @@ def test_binary_usd_with_impossible_counts_is_refused_at_once(whole: Path, tmp_p
 def test_factors_that_are_no_numbers_are_refused(ball: Asset, value: float) -> None:
     from appearance_opt.asset.validate import repair
 
-    for change in ({"roughness": value}, {"base_color": (1.0, value, 1.0)}, {"normal_scale": value}):
+    for change in (
+        {"roughness": value},
+        {"base_color": (1.0, value, 1.0)},
+        {"normal_scale": value},
+    ):
         bad = replace(ball.meshes[0], material=replace(ball.meshes[0].material, **change))
         with pytest.raises(InputError, match="a factor is NaN or infinite"):
             repair(Asset((bad,)), "x.glb")
@@ -242,14 +295,21 @@ def test_values_beyond_their_range_are_clamped_with_a_note(ball: Asset) -> None:
     mesh = ball.meshes[0]
     hdr = Texture(np.linspace(-1, 9, 12, dtype=np.float32).reshape(2, 2, 3), "linear")
     material = replace(Material(base_color=(2.0, -1.0, 0.5), roughness=3.0), base_color_texture=hdr)
-    bad = replace(mesh, material=material, uvs=mesh.uvs * np.float32(1e9), colors=mesh.positions - 1)
+    bad = replace(
+        mesh, material=material, uvs=mesh.uvs * np.float32(1e9), colors=mesh.positions - 1
+    )
     out = repair(Asset((bad, replace(bad, name="twin"))), "x.glb")
     got = out.meshes[0]
     assert got.material.base_color == (1.0, 0.0, 0.5) and got.material.roughness == 1.0
     assert got.material is out.meshes[1].material  # shared before, shared after
-    assert got.material.base_color_texture.pixels.min() >= 0 and got.material.base_color_texture.pixels.max() <= 1
+    assert (
+        got.material.base_color_texture.pixels.min() >= 0
+        and got.material.base_color_texture.pixels.max() <= 1
+    )
     assert np.abs(got.uvs).max() <= MAX_UV and got.colors.min() >= 0
-    assert sum("clamped" in n for n in out.notes) == 4  # uvs and colours of both meshes, factors and texels
+    assert (
+        sum("clamped" in n for n in out.notes) == 4
+    )  # uvs and colours of both meshes, factors and texels
     assert sum(n.startswith("meshes 'ball', 'twin': ") and "clamped" in n for n in out.notes) == 2
 
 
@@ -257,7 +317,11 @@ def test_attributes_that_do_not_fit_the_positions_are_refused(ball: Asset) -> No
     from appearance_opt.asset.validate import repair
 
     mesh = ball.meshes[0]
-    for change in ({"normals": mesh.normals[:-1]}, {"uvs": mesh.positions}, {"tangents": np.zeros((0, 4), np.float32)}):
+    for change in (
+        {"normals": mesh.normals[:-1]},
+        {"uvs": mesh.positions},
+        {"tangents": np.zeros((0, 4), np.float32)},
+    ):
         with pytest.raises(InputError, match="numbers for"):
             repair(Asset((replace(mesh, **change),)), "x.glb")
 
@@ -276,7 +340,9 @@ def test_geometry_files_with_faces_out_of_range(tmp_path: Path, where: str) -> N
         load(tmp_path / f"x.{where}")
 
 
-def test_a_writer_that_runs_out_of_disk_in_the_last_flush_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_writer_that_runs_out_of_disk_in_the_last_flush_says_so(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     import OpenImageIO as oiio
 
     real = oiio.ImageOutput.create
@@ -294,6 +360,8 @@ def test_a_writer_that_runs_out_of_disk_in_the_last_flush_says_so(monkeypatch: p
             self._real.close()
             return False
 
-    monkeypatch.setattr(oiio, "ImageOutput", type("Output", (), {"create": staticmethod(partial(Full))}))
+    monkeypatch.setattr(
+        oiio, "ImageOutput", type("Output", (), {"create": staticmethod(partial(Full))})
+    )
     with pytest.raises(OSError, match="cannot encode"):
         images.encode_png(np.zeros((4, 4, 3), np.uint8))

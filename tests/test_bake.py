@@ -41,7 +41,9 @@ CLOSED = bake_options(closed_form=True, texture_size=SIZE, samples=1)
 
 def asset_of(mesh: LatentMesh, name: str = "low") -> Asset:
     """A latent as an asset without material."""
-    return Asset((Mesh(mesh.positions[mesh.frame_vertex], mesh.frame_faces, uvs=mesh.uvs, name=name),), name)
+    return Asset(
+        (Mesh(mesh.positions[mesh.frame_vertex], mesh.frame_faces, uvs=mesh.uvs, name=name),), name
+    )
 
 
 @pytest.fixture(scope="module")
@@ -50,14 +52,24 @@ def low_sphere() -> Asset:
     return asset_of(sphere(300, (0.0, 0.0, 0.0), 1.0, SIZE))
 
 
-def square(z: float = 0.0, half: float = 1.0, normal: tuple[float, float, float] = (0, 0, 1), n: int = 1) -> Mesh:
+def square(
+    z: float = 0.0, half: float = 1.0, normal: tuple[float, float, float] = (0, 0, 1), n: int = 1
+) -> Mesh:
     """[-half, half]^2 facing +Z, n x n quads; u grows with x, v against y."""
     u, v = (a.ravel() for a in np.meshgrid(np.linspace(0, 1, n + 1), np.linspace(0, 1, n + 1)))
-    p = np.stack([half * (2 * u - 1), half * (1 - 2 * v), np.full_like(u, z)], axis=1).astype(np.float32)
+    p = np.stack([half * (2 * u - 1), half * (1 - 2 * v), np.full_like(u, z)], axis=1).astype(
+        np.float32
+    )
     i = np.arange((n + 1) * n).reshape(n, n + 1)[:, :-1].ravel()
-    f = np.concatenate([np.stack([i, i + n + 1, i + 1], 1), np.stack([i + 1, i + n + 1, i + n + 2], 1)])
-    normals = np.tile(np.asarray(normal, np.float32) / np.linalg.norm(normal), (len(p), 1)).astype(np.float32)
-    return Mesh(p, f.astype(np.int32), normals, np.stack([u, v], 1).astype(np.float32), name="square")
+    f = np.concatenate(
+        [np.stack([i, i + n + 1, i + 1], 1), np.stack([i + 1, i + n + 1, i + n + 2], 1)]
+    )
+    normals = np.tile(np.asarray(normal, np.float32) / np.linalg.norm(normal), (len(p), 1)).astype(
+        np.float32
+    )
+    return Mesh(
+        p, f.astype(np.int32), normals, np.stack([u, v], 1).astype(np.float32), name="square"
+    )
 
 
 def cube() -> Mesh:
@@ -109,9 +121,12 @@ def test_a_sphere_over_a_coarse_one_has_known_normals_and_heights(low_sphere: As
     # measured 0.03 degrees
     assert np.degrees(np.arccos(np.clip(np.sum(found * expected, axis=1), -1, 1))).max() < 0.1
     bitangent = np.cross(n, t) * hand[:, None]
-    shaded = sum(maps[f"normal_{a}"][:, None] * v for a, v in zip("xyz", (t, bitangent, n), strict=True))
+    shaded = sum(
+        maps[f"normal_{a}"][:, None] * v for a, v in zip("xyz", (t, bitangent, n), strict=True)
+    )
     shaded /= np.linalg.norm(shaded, axis=1, keepdims=True)
-    # the same normal through the shader's tangent basis: only float32 in between (measured 0.04 degrees)
+    # the same normal through the shader's tangent basis: only float32 in between (measured 0.04
+    # degrees)
     assert np.degrees(np.arccos(np.clip(np.sum(shaded * expected, axis=1), -1, 1))).max() < 0.1
 
 
@@ -133,7 +148,12 @@ def test_tilts_have_the_sign_that_engines_expect(tmp_path: Path) -> None:
     for name in ("opengl", "directx"):
         stored = load(tmp_path / f"{name}.glb").meshes[0].material.normal_texture
         np.testing.assert_array_equal(stored.pixels[..., :3], files["opengl"])
-    assert json.loads((tmp_path / "directx" / "directx_maps.json").read_text())["maps"]["normal"]["green"] == "directx"
+    assert (
+        json.loads((tmp_path / "directx" / "directx_maps.json").read_text())["maps"]["normal"][
+            "green"
+        ]
+        == "directx"
+    )
 
 
 @pytest.mark.parametrize(("radius", "height"), [(0.5, 0.5), (0.3, 0.6)])
@@ -141,13 +161,19 @@ def test_occlusion_under_a_disc(radius: float, height: float) -> None:
     ring = np.linspace(0, 2 * np.pi, 129)[:-1]
     rim = np.stack([radius * np.cos(ring), radius * np.sin(ring), np.full_like(ring, height)], 1)
     p = np.concatenate([rim, [[0, 0, height]]]).astype(np.float32)
-    f = np.stack([np.roll(np.arange(128), -1), np.arange(128), np.full(128, 128)], 1).astype(np.int32)
+    f = np.stack([np.roll(np.arange(128), -1), np.arange(128), np.full(128, 128)], 1).astype(
+        np.int32
+    )
     high = Asset((square(n=2), Mesh(p, f, name="disc")), "high")
     baked, _ = baked_pair(high, Asset((square(),), "low"), "ao", ao_rays=1024, reach=0.1)
-    middle = baked.maps["occlusion"][SIZE // 2 - 1 : SIZE // 2 + 1, SIZE // 2 - 1 : SIZE // 2 + 1].mean()
+    middle = baked.maps["occlusion"][
+        SIZE // 2 - 1 : SIZE // 2 + 1, SIZE // 2 - 1 : SIZE // 2 + 1
+    ].mean()
     # cosine-weighted form factor of a disc seen from below its centre; measured within 0.002
     assert middle == pytest.approx(1 - radius**2 / (radius**2 + height**2), abs=0.005)
-    near, _ = baked_pair(high, Asset((square(),), "low"), "ao", ao_rays=16, reach=0.1, ao_distance=0.9 * height)
+    near, _ = baked_pair(
+        high, Asset((square(),), "low"), "ao", ao_rays=16, reach=0.1, ao_distance=0.9 * height
+    )
     assert near.maps["occlusion"].min() == 1
 
 
@@ -155,14 +181,18 @@ def test_curvature_of_spheres_and_a_cube() -> None:
     ball = sphere_mesh(5_000, Material("white"), 0.5)
     # discretisation: measured 2.0005 to 2.0026
     np.testing.assert_allclose(mean_curvature(ball.positions, ball.faces), 2.0, rtol=0.003)
-    np.testing.assert_allclose(mean_curvature(ball.positions, ball.faces[:, ::-1]), -2.0, rtol=0.003)
+    np.testing.assert_allclose(
+        mean_curvature(ball.positions, ball.faces[:, ::-1]), -2.0, rtol=0.003
+    )
     flat = square(n=4)
     np.testing.assert_array_equal(mean_curvature(flat.positions, flat.faces), 0)
     box = cube()
     # half of three edges of length 1 at a right angle, over an eighth of the surface
     expected = 3 * 0.5 * (np.pi / 2) * 0.5 / (6 / 8)
     np.testing.assert_allclose(mean_curvature(box.positions, box.faces), expected, rtol=1e-6)
-    baked, _ = baked_pair(Asset((ball,), "b"), asset_of(sphere(300, (0, 0, 0), 0.5, SIZE)), "curvature")
+    baked, _ = baked_pair(
+        Asset((ball,), "b"), asset_of(sphere(300, (0, 0, 0), 0.5, SIZE)), "curvature"
+    )
     np.testing.assert_allclose(baked.maps["curvature"], 2.0, rtol=0.003)
 
 
@@ -203,7 +233,9 @@ def test_maps_that_are_not_asked_for_stay(tmp_path: Path, ball: Asset) -> None:
     assert result.orm_texture is None and result.normal_texture is not None
 
 
-def test_bands_and_one_piece_agree(ball: Asset, low_sphere: Asset, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_bands_and_one_piece_agree(
+    ball: Asset, low_sphere: Asset, monkeypatch: pytest.MonkeyPatch
+) -> None:
     whole, _ = baked_pair(ball, low_sphere, "material", "ao", samples=2, ao_rays=4)
     monkeypatch.setattr(texel_points, "BAND", SIZE * 24)  # 24 does not divide 64
     banded, _ = baked_pair(ball, low_sphere, "material", "ao", samples=2, ao_rays=4)
@@ -212,7 +244,9 @@ def test_bands_and_one_piece_agree(ball: Asset, low_sphere: Asset, monkeypatch: 
         # float32 in another order (measured 6e-8)
         np.testing.assert_allclose(whole.maps[name], banded.maps[name], atol=1e-6)
     # other random shifts of the rays (measured 0.002)
-    assert whole.maps["occlusion"].mean() == pytest.approx(banded.maps["occlusion"].mean(), abs=0.01)
+    assert whole.maps["occlusion"].mean() == pytest.approx(
+        banded.maps["occlusion"].mean(), abs=0.01
+    )
 
 
 def test_a_latent_with_its_own_normals_is_drawn_as_the_asset() -> None:
@@ -221,7 +255,10 @@ def test_a_latent_with_its_own_normals_is_drawn_as_the_asset() -> None:
     normal[..., 2] = 255
     big = normal.repeat(8, 0).repeat(8, 1)
     box = cube()
-    asset = Asset((replace(box, material=Material("m", (0.8, 0.5, 0.3), 0.5, normal_texture=Texture(big))),), "cube")
+    asset = Asset(
+        (replace(box, material=Material("m", (0.8, 0.5, 0.3), 0.5, normal_texture=Texture(big))),),
+        "cube",
+    )
     low = prepare(asset)
     n = big.astype(np.float32) / 255 * 2 - 1
     maps = {"red": 0.8, "green": 0.5, "blue": 0.3, "roughness": 0.5, "metalness": 0.0}
@@ -229,7 +266,12 @@ def test_a_latent_with_its_own_normals_is_drawn_as_the_asset() -> None:
     model = Model(low.mesh, maps, frozenset(["normal"]), Rates())
     views = ViewSampler((0.0, 0.0, 0.0), 0.9).draw(0, 3)
     ours = render_image(
-        model.scene, model.surface(model.positions()), model.maps(model.fitted_layer()), views.records(), Grid(3, 64), 4
+        model.scene,
+        model.surface(model.positions()),
+        model.maps(model.fitted_layer()),
+        views.records(),
+        Grid(3, 64),
+        4,
     )
     theirs = MeshReference(low.asset).render(views, 64, 4)
     # the same data through two paths: texels are clamped and stored once more (measured 70 dB)
@@ -237,7 +279,9 @@ def test_a_latent_with_its_own_normals_is_drawn_as_the_asset() -> None:
     assert model.topology.edges.count == 18  # 12 edges and 6 diagonals: hard edges are no borders
 
 
-def test_the_fit_improves_on_the_closed_form_and_keeps_the_shape(ball: Asset, tmp_path: Path) -> None:
+def test_the_fit_improves_on_the_closed_form_and_keeps_the_shape(
+    ball: Asset, tmp_path: Path
+) -> None:
     low = asset_of(sphere(600, (0.0, 0.0, 0.0), 1.0, 32))
     options = bake_options(texture_size=32, resolution=192, pool=8, steps=40)
     result = bake(ball, low, tmp_path / "out.usda", options, report=tmp_path / "report")
@@ -255,8 +299,12 @@ def test_the_fit_improves_on_the_closed_form_and_keeps_the_shape(ball: Asset, tm
 
 def test_rays_that_miss_are_counted_and_filled() -> None:
     high = square(n=8)
-    hole = replace(high, faces=high.faces[(np.abs(high.positions[high.faces].mean(axis=1)) > 0.25).any(axis=1)])
-    baked, _ = baked_pair(Asset((hole,), "h"), Asset((square(),), "l"), "material", "displacement", reach=0.1)
+    hole = replace(
+        high, faces=high.faces[(np.abs(high.positions[high.faces].mean(axis=1)) > 0.25).any(axis=1)]
+    )
+    baked, _ = baked_pair(
+        Asset((hole,), "h"), Asset((square(),), "l"), "material", "displacement", reach=0.1
+    )
     # a hole of half the width has a quarter of the area
     assert baked.missed_share == pytest.approx(1 / 16, abs=0.01)
     assert baked.missed[SIZE // 2, SIZE // 2] and np.isfinite(baked.maps["red"]).all()
@@ -273,20 +321,29 @@ def test_outermost_sees_what_floats(low_sphere: Asset) -> None:
 
 
 def test_align_finds_scale_and_place(ball: Asset, low_sphere: Asset) -> None:
-    shape = replace(low_sphere.meshes[0], positions=low_sphere.meshes[0].positions * np.float32([1, 0.6, 0.8]))
-    bumpy = replace(ball.meshes[0], positions=ball.meshes[0].positions * np.float32([1, 0.6, 0.8]), normals=None)
+    shape = replace(
+        low_sphere.meshes[0], positions=low_sphere.meshes[0].positions * np.float32([1, 0.6, 0.8])
+    )
+    bumpy = replace(
+        ball.meshes[0], positions=ball.meshes[0].positions * np.float32([1, 0.6, 0.8]), normals=None
+    )
     apart = replace(bumpy, positions=bumpy.positions * np.float32(0.25) + np.float32([3, -2, 1]))
     placed, scale, _ = align(Asset((apart,), "high"), Asset((shape,), "low"))
     # an inscribed polyhedron is smaller than its sphere: measured 0.985 of it
     assert scale == pytest.approx(4.0, rel=0.03)
     low, high = placed.bounds()
     np.testing.assert_allclose((low + high) / 2, 0, atol=0.01)
-    result = bake(Asset((apart,), "high"), Asset((shape,), "low"), None, replace(CLOSED, align=True))
+    result = bake(
+        Asset((apart,), "high"), Asset((shape,), "low"), None, replace(CLOSED, align=True)
+    )
     assert any("HIGH was scaled by" in n for n in result.notes) and result.missed_share == 0
 
 
 def test_unwrap_gives_an_atlas_and_keeps_faces() -> None:
-    low = Asset((replace(cube(), uvs=None), replace(cube(), uvs=None, positions=cube().positions + 2)), "low")
+    low = Asset(
+        (replace(cube(), uvs=None), replace(cube(), uvs=None, positions=cube().positions + 2)),
+        "low",
+    )
     out = unwrap_asset(low, SIZE)
     for a, b in zip(low.meshes, out.meshes, strict=True):
         np.testing.assert_array_equal(a.positions[a.faces], b.positions[b.faces])
@@ -312,10 +369,19 @@ def _without_area(mesh: Mesh) -> Mesh:
     ("change", "words"),
     [
         (lambda m: replace(m, uvs=None), "1 of 1 meshes have no texture coordinates; use --unwrap"),
-        (lambda m: replace(m, uvs=m.uvs * 3), "of 24 texture coordinates lie outside the unit square"),
-        (lambda m: replace(m, uvs=m.uvs % np.float32([1, 0.5])), "of 12 triangles overlap others in texture space"),
+        (
+            lambda m: replace(m, uvs=m.uvs * 3),
+            "of 24 texture coordinates lie outside the unit square",
+        ),
+        (
+            lambda m: replace(m, uvs=m.uvs % np.float32([1, 0.5])),
+            "of 12 triangles overlap others in texture space",
+        ),
         (_without_area, "2 triangles have no area in texture space, 17 % of the surface"),
-        (lambda m: replace(m, positions=m.positions + 1), r"1.732 m apart \(100 % of HIGH's size\)"),
+        (
+            lambda m: replace(m, positions=m.positions + 1),
+            r"1.732 m apart \(100 % of HIGH's size\)",
+        ),
         (lambda m: replace(m, positions=m.positions * 3), "LOW is 3 times as large; use --align"),
     ],
 )
@@ -328,7 +394,10 @@ def test_unusable_pairs_are_refused(change, words: str, tmp_path: Path) -> None:
 
 def test_a_cage_that_reaches_nothing_is_refused(ball: Asset) -> None:
     low = asset_of(sphere(60, (0.0, 0.0, 0.0), 0.97, SIZE))
-    with pytest.raises(InputError, match=r"of the rays found nothing of HIGH within 0\.0001 m: give a larger --cage"):
+    with pytest.raises(
+        InputError,
+        match=r"of the rays found nothing of HIGH within 0\.0001 m: give a larger --cage",
+    ):
         bake(ball, low, None, replace(CLOSED, cage=1e-4))
 
 
@@ -358,8 +427,15 @@ def test_the_public_function_is_not_hidden_by_a_package() -> None:
 def test_bake_as_a_user_would(ball: Asset, low_sphere: Asset, tmp_path: Path) -> None:
     save(ball, tmp_path / "high.glb")
     save(low_sphere, tmp_path / "low.glb")
-    (tmp_path / "job.toml").write_text('texture-size = 64\nmaps = "normal,ao,displacement"\nbits = 16\nao-rays = 4\n')
-    assert read_toml(tmp_path / "job.toml", frozenset(["texture_size", "maps", "bits", "ao_rays"]))["bits"] == 16
+    (tmp_path / "job.toml").write_text(
+        'texture-size = 64\nmaps = "normal,ao,displacement"\nbits = 16\nao-rays = 4\n'
+    )
+    assert (
+        read_toml(tmp_path / "job.toml", frozenset(["texture_size", "maps", "bits", "ao_rays"]))[
+            "bits"
+        ]
+        == 16
+    )
     command = [
         "bake",
         "high.glb",
@@ -376,9 +452,18 @@ def test_bake_as_a_user_would(ball: Asset, low_sphere: Asset, tmp_path: Path) ->
     assert "0.00 % of the texels missed" in done.stdout
     assert load(tmp_path / "out.glb").meshes[0].material.normal_texture.pixels.dtype == np.uint16
     names = {p.name for p in (tmp_path / "out_maps").iterdir()}
-    expected = {"normal.png", "ao.png", "displacement.png", "displacement.exr", "coverage.png", "maps.json"}
+    expected = {
+        "normal.png",
+        "ao.png",
+        "displacement.png",
+        "displacement.exr",
+        "coverage.png",
+        "maps.json",
+    }
     assert names == {f"out_{n}" for n in expected}
-    assert (tmp_path / "out_displacement.png").read_bytes() == (tmp_path / "out_maps/out_displacement.png").read_bytes()
+    assert (tmp_path / "out_displacement.png").read_bytes() == (
+        tmp_path / "out_maps/out_displacement.png"
+    ).read_bytes()
     done = run("bake", "high.glb", "low.glb", "--out", "low.glb", cwd=tmp_path)
     assert done.returncode == 2
     assert done.stderr.splitlines()[-1].startswith("error: low.glb: is the input itself")

@@ -1,4 +1,5 @@
-"""Checkpoints: what is kept of a job, which job and which start it belongs to, and folders that hold other things."""
+"""Checkpoints: what is kept of a job, which job and which start it belongs to, and folders that
+hold other things."""
 
 from __future__ import annotations
 
@@ -37,7 +38,11 @@ class Outer:
 
 
 def outer() -> Outer:
-    return Outer(Inner(np.arange(6.0).reshape(2, 3), float("-inf")), {"a": np.ones(3, np.uint8), "b": 0.1}, (1, (2, 3)))
+    return Outer(
+        Inner(np.arange(6.0).reshape(2, 3), float("-inf")),
+        {"a": np.ones(3, np.uint8), "b": 0.1},
+        (1, (2, 3)),
+    )
 
 
 def same(a: object, b: object) -> bool:
@@ -117,7 +122,9 @@ def test_every_field_counts_in_a_hash(ball: Asset) -> None:
             object.__setattr__(other, f.name, varied(getattr(thing, f.name)))
             assert digest(other) != digest(thing), f.name
     assert digest(Texture(texture.pixels.copy())) == digest(Texture(texture.pixels))
-    assert digest(np.zeros((2, 3))) != digest(np.zeros((3, 2))) != digest(np.zeros((3, 2), np.float32))
+    assert (
+        digest(np.zeros((2, 3))) != digest(np.zeros((3, 2))) != digest(np.zeros((3, 2), np.float32))
+    )
     assert digest({"a": 1, "b": 2}) == digest({"b": 2, "a": 1}) != digest({"a": 2, "b": 1})
     with pytest.raises(TypeError, match="a object has no hash"):
         digest([object()])
@@ -136,7 +143,15 @@ def test_a_job_is_known_by_what_was_read_not_by_where_it_lay(ball: Asset) -> Non
 
 
 def options(**values: object) -> SimplifyOptions:
-    base = {"triangles": 100, "texture_size": 32, "resolution": 32, "pool": 4, "views": 2, "steps": 2, "budget": None}
+    base = {
+        "triangles": 100,
+        "texture_size": 32,
+        "resolution": 32,
+        "pool": 4,
+        "views": 2,
+        "steps": 2,
+        "budget": None,
+    }
     return simplify_options(**{**base, **values})
 
 
@@ -173,9 +188,15 @@ def test_all_of_a_start_is_kept(tmp_path: Path) -> None:
 
     maps, known = {"red": rng.random((2, 2)), "blue": 0.5}, np.ones((2, 2), bool)
     start = Start(mesh(), maps, True, known, (0, 2), mesh(), True, mesh(), ("clustered first",))
-    assert all(getattr(start, f.name) is not f.default for f in fields(Start)), "give each field a value of its own"
-    first, _ = Checkpointer(tmp_path, "job", resume=False).start(lambda: (start, False), Start, LatentMesh)
-    second, _ = Checkpointer(tmp_path, "job", resume=True).start(lambda: (None, False), Start, LatentMesh)
+    assert all(getattr(start, f.name) is not f.default for f in fields(Start)), (
+        "give each field a value of its own"
+    )
+    first, _ = Checkpointer(tmp_path, "job", resume=False).start(
+        lambda: (start, False), Start, LatentMesh
+    )
+    second, _ = Checkpointer(tmp_path, "job", resume=True).start(
+        lambda: (None, False), Start, LatentMesh
+    )
     assert same(first, start) and same(second, start)
 
 
@@ -194,9 +215,9 @@ def test_a_checkpoint_that_finds_no_room_does_not_end_the_fit(
     monkeypatch.setattr("appearance_opt.jobs.simplify.CHECKPOINT_SECONDS", 0.0)
     result = appearance_opt.simplify(ball, None, options(), checkpoint=tmp_path / "state")
     assert result.fit.steps == 2 and len(tries) == 3
-    assert [r.getMessage().split(": ")[1] for r in caplog.records if "fit.npz" in r.getMessage()] == [
-        "cannot be written (No space left on device); the fit goes on without"
-    ]
+    assert [
+        r.getMessage().split(": ")[1] for r in caplog.records if "fit.npz" in r.getMessage()
+    ] == ["cannot be written (No space left on device); the fit goes on without"]
 
 
 def test_meshes_hash_alike_whether_shared_or_copied() -> None:

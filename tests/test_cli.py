@@ -23,9 +23,12 @@ from tests.looks import COMMAND, ENVIRONMENT
 def run(
     *arguments: str, cwd: Path | None = None, small: bool = False, **environment: str
 ) -> subprocess.CompletedProcess[str]:
-    """``small``: with the small looks of ``tests.looks``. Files in ``cwd`` stay what they are, but for the result."""
+    """``small``: with the small looks of ``tests.looks``. Files in ``cwd`` stay what they are, but
+    for the result."""
     start = ["-c", COMMAND] if small else ["-m", "appearance_opt"]
-    written = [Path(arguments[k + 1]).stem + "*" for k, a in enumerate(arguments[:-1]) if a == "--out"]
+    written = [
+        Path(arguments[k + 1]).stem + "*" for k, a in enumerate(arguments[:-1]) if a == "--out"
+    ]
     with nullcontext() if cwd is None else unchanged(cwd, *written):
         return subprocess.run(
             [sys.executable, *start, *arguments],
@@ -35,7 +38,9 @@ def run(
 
 def test_simplify_and_compare_as_a_user_would(ball: Asset, tmp_path: Path) -> None:
     save(ball, tmp_path / "ball.glb")
-    (tmp_path / "job.toml").write_text('texture-size = 64\nresolution = 48\npool = 8\nsteps = 4\nbudget = "2m"\n')
+    (tmp_path / "job.toml").write_text(
+        'texture-size = 64\nresolution = 48\npool = 8\nsteps = 4\nbudget = "2m"\n'
+    )
     done = run(
         "simplify",
         "ball.glb",
@@ -51,8 +56,23 @@ def test_simplify_and_compare_as_a_user_would(ball: Asset, tmp_path: Path) -> No
     assert done.returncode == 0, done.stderr
     assert "of 2208 triangles" in done.stdout
     assert (tmp_path / "low.report" / "report.html").is_file()
-    assert json.loads((tmp_path / "low.report" / "report.json").read_text())["metrics"]["result"]["psnr_covered"] > 20
-    done = run("compare", "ball.glb", "low.glb", "--json", "--views", "2", "--resolution", "64", cwd=tmp_path)
+    assert (
+        json.loads((tmp_path / "low.report" / "report.json").read_text())["metrics"]["result"][
+            "psnr_covered"
+        ]
+        > 20
+    )
+    done = run(
+        "compare",
+        "ball.glb",
+        "low.glb",
+        "--json",
+        "--views",
+        "2",
+        "--resolution",
+        "64",
+        cwd=tmp_path,
+    )
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout)["psnr"] > 20
 
@@ -60,23 +80,43 @@ def test_simplify_and_compare_as_a_user_would(ball: Asset, tmp_path: Path) -> No
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["simplify", "absent.glb", "--triangles", "10", "--out", "x.glb"], "absent.glb: no such file"),
+        (
+            ["simplify", "absent.glb", "--triangles", "10", "--out", "x.glb"],
+            "absent.glb: no such file",
+        ),
         (["simplify", "ball.glb", "--triangles", "0", "--out", "x.glb"], "at least 1"),
         (["simplify", "ball.glb", "--out", "x.glb"], "--triangles N or --ratio R"),
-        (["simplify", "ball.glb", "--triangles", "99999", "--out", "x.glb"], "has only 2208 triangles"),
+        (
+            ["simplify", "ball.glb", "--triangles", "99999", "--out", "x.glb"],
+            "has only 2208 triangles",
+        ),
         (["simplify", "ball.glb", "--triangles", "10", "--out", "ball.glb"], "is the input itself"),
         (["simplify", "ball.glb", "--triangles", "10", "--out", "x.fbx"], "cannot write '.fbx'"),
         (["simplify", "ball.glb", "--triangles", "10", "--out", "ball.glb/x.glb"], "not a folder"),
         (["simplify", "ball.glb", "--triangles", "ten", "--out", "x.glb"], "valid integer"),
-        (["simplify", "ball.glb", "--triangles", "10", "--out", "x.glb", "--fit", "shap"], "did you mean 'shape'"),
-        (["simplify", "ball.glb", "--triangles", "10", "--out", "x.glb", "--budget", "soon"], "not a time"),
-        (["simplify", "ball.glb", "--triangles", "10", "--out", "x.glb", "--config", "bad.toml"], "did you mean"),
-        (["simplify", "ball.glb", "--triangles", "10", "--out", "x.glb", "--resume"], "--checkpoint"),
+        (
+            ["simplify", "ball.glb", "--triangles", "10", "--out", "x.glb", "--fit", "shap"],
+            "did you mean 'shape'",
+        ),
+        (
+            ["simplify", "ball.glb", "--triangles", "10", "--out", "x.glb", "--budget", "soon"],
+            "not a time",
+        ),
+        (
+            ["simplify", "ball.glb", "--triangles", "10", "--out", "x.glb", "--config", "bad.toml"],
+            "did you mean",
+        ),
+        (
+            ["simplify", "ball.glb", "--triangles", "10", "--out", "x.glb", "--resume"],
+            "--checkpoint",
+        ),
         (["compare", "ball.glb", "empty.glb"], "empty"),
         (["nonsense"], "nonsense"),
     ],
 )
-def test_mistakes_end_in_one_line_and_code_2(ball: Asset, tmp_path: Path, arguments: list[str], words: str) -> None:
+def test_mistakes_end_in_one_line_and_code_2(
+    ball: Asset, tmp_path: Path, arguments: list[str], words: str
+) -> None:
     save(ball, tmp_path / "ball.glb")
     before = (tmp_path / "ball.glb").read_bytes()
     (tmp_path / "empty.glb").write_bytes(b"")
@@ -107,7 +147,9 @@ def test_a_root_is_passed_on(ball: Asset, tmp_path: Path) -> None:
     for name in ("library", "shot"):
         (tmp_path / name).mkdir()
     save(ball, tmp_path / "library" / "ball.usda")
-    (tmp_path / "shot" / "scene.usda").write_text("#usda 1.0\n(subLayers = [@../library/ball.usda@])\n")
+    (tmp_path / "shot" / "scene.usda").write_text(
+        "#usda 1.0\n(subLayers = [@../library/ball.usda@])\n"
+    )
     refused = run("inspect", "shot/scene.usda", cwd=tmp_path)
     assert refused.returncode == 2
     assert "--root" in refused.stderr
@@ -132,7 +174,8 @@ def test_threads_are_limited_by_the_environment() -> None:
 
 
 @pytest.mark.parametrize(
-    ("content", "count"), [("200000 100000\n", 2), ("150000 100000\n", 2), ("5000 100000\n", 1), ("max 100000\n", None)]
+    ("content", "count"),
+    [("200000 100000\n", 2), ("150000 100000\n", 2), ("5000 100000\n", 1), ("max 100000\n", None)],
 )
 def test_a_containers_quota_is_known(tmp_path: Path, content: str, count: int | None) -> None:
     (tmp_path / "cpu.max").write_text(content)

@@ -1,5 +1,5 @@
-"""What a file of many parts costs: what is shared is read and mended once, what is alike is noted once. Counted in
-calls and lines, not in seconds."""
+"""What a file of many parts costs: what is shared is read and mended once, what is alike is noted
+once. Counted in calls and lines, not in seconds."""
 
 from __future__ import annotations
 
@@ -55,7 +55,10 @@ def test_notes_of_a_kind_are_one_line() -> None:
     many = Notes()
     for k in range(100):
         many(f"file {k} is not there", "files that are not there")
-    assert len(many.lines()) == LINES + 1 and many.lines()[-1] == "... and 92 more: files that are not there"
+    assert (
+        len(many.lines()) == LINES + 1
+        and many.lines()[-1] == "... and 92 more: files that are not there"
+    )
 
 
 def test_an_accessor_is_read_once_and_a_primitive_keeps_what_it_uses(
@@ -68,7 +71,9 @@ def test_an_accessor_is_read_once_and_a_primitive_keeps_what_it_uses(
     given["meshes"] = []
     for k in range(0, len(faces), 7):
         given["accessors"].append(view | {"byteOffset": 12 * k, "count": 3 * len(faces[k : k + 7])})
-        given["meshes"].append({"primitives": [primitive | {"indices": len(given["accessors"]) - 1}]})
+        given["meshes"].append(
+            {"primitives": [primitive | {"indices": len(given["accessors"]) - 1}]}
+        )
     given["nodes"] = [{"mesh": k} for k in range(len(given["meshes"]))]
     given["scenes"] = [{"nodes": list(range(len(given["nodes"])))}]
     write_glb(tmp_path / "x.glb", given, binary)
@@ -82,7 +87,9 @@ def test_an_accessor_is_read_once_and_a_primitive_keeps_what_it_uses(
     assert not load(tmp_path / "x.glb").notes
 
 
-def test_nodes_that_share_a_mesh_read_it_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nodes_that_share_a_mesh_read_it_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     positions, faces, _ = grid_sphere(4, 8)
     nodes = [{"mesh": 0, "name": f"n{k}", "translation": [k, 0, 0]} for k in range(50)]
     given, binary = document({"POSITION": positions, "NORMAL": positions}, faces, nodes=nodes)
@@ -92,7 +99,9 @@ def test_nodes_that_share_a_mesh_read_it_once(tmp_path: Path, monkeypatch: pytes
     asset = load(tmp_path / "x.glb")
     assert calls.total() == 1
     assert [m.name for m in asset.meshes] == [f"n{k}" for k in range(50)]
-    np.testing.assert_allclose(asset.meshes[49].positions, asset.meshes[0].positions + [49, 0, 0], atol=1e-5)
+    np.testing.assert_allclose(
+        asset.meshes[49].positions, asset.meshes[0].positions + [49, 0, 0], atol=1e-5
+    )
 
 
 def test_instances_are_one_mesh_with_turned_faces_where_they_are_mirrored(tmp_path: Path) -> None:
@@ -126,7 +135,11 @@ def spoilt_asset(count: int) -> tuple[Asset, list[int]]:
     nan = np.float32(np.nan)
     faults = {
         5: {"faces": np.concatenate([faces, [[0, 0, 1]]]).astype(np.int32)},
-        11: {"positions": np.concatenate([positions, [[9, 9, 9]]]).astype(np.float32), "normals": None, "uvs": None},
+        11: {
+            "positions": np.concatenate([positions, [[9, 9, 9]]]).astype(np.float32),
+            "normals": None,
+            "uvs": None,
+        },
         17: {"uvs": uvs * np.float32(1e9)},
         23: {"normals": normals * nan},
         29: {"normals": normals * 2},
@@ -163,7 +176,11 @@ def test_counts_of_many_meshes_are_the_sums_of_each() -> None:
     each = [validate.validate(replace(asset, meshes=(m,))) for m in asset.meshes]
     for f in fields(Validation):
         assert getattr(every, f.name) == sum(getattr(one, f.name) for one in each), f.name
-    assert every.connected_parts == 60 and every.degenerate_faces == 1 and every.unreferenced_vertices == 1
+    assert (
+        every.connected_parts == 60
+        and every.degenerate_faces == 1
+        and every.unreferenced_vertices == 1
+    )
 
 
 class CountedReads(list):
@@ -202,7 +219,9 @@ def test_rows_are_found_equal_as_numpy_finds_them() -> None:
         np.testing.assert_array_equal(kind, inverse.ravel())
         assert count_unique_rows(rows) == len(expected)
         values = rows - 1.5
-        np.testing.assert_array_equal(np.unique(values, axis=0), values[unique_rows(rank_rows(values))[0]])
+        np.testing.assert_array_equal(
+            np.unique(values, axis=0), values[unique_rows(rank_rows(values))[0]]
+        )
 
 
 USD_INSTANCES = """#usda 1.0
@@ -260,14 +279,17 @@ def test_many_meshes_are_merged_in_one_go_as_each_alone(monkeypatch: pytest.Monk
         {}, {"uvs": uvs, "material": wearing}, {"uvs": uvs, "normals": positions, "material": wearing},
         {"colors": np.full((len(positions), 3), 0.25, np.float32)},
     ]  # fmt: skip
-    # open fans of the ball: their borders would be smoothed across if they were taken for one surface
+    # open fans of the ball: their borders would be smoothed across if they were taken for one
+    # surface
     meshes = []
     for k in range(40):
         used, corners = np.unique(faces[2 * k : 2 * k + 2], return_inverse=True)
         given = {n: v[used] if isinstance(v, np.ndarray) else v for n, v in kinds[k % 4].items()}
         meshes.append(Mesh(positions[used], corners.reshape(-1, 3).astype(np.int32), **given))
     numbers = [m.material is wearing for m in meshes]
-    each = [mesh_reference.merge(Asset((m,)), [n], True) for m, n in zip(meshes, numbers, strict=True)]
+    each = [
+        mesh_reference.merge(Asset((m,)), [n], True) for m, n in zip(meshes, numbers, strict=True)
+    ]
     calls = count_calls(monkeypatch, batch, "summed_normals")
     every = mesh_reference.merge(Asset(tuple(meshes)), numbers, True)
     assert calls.total() == 1
@@ -285,7 +307,9 @@ def test_materials_of_all_sizes_share_one_buffer() -> None:
     pyramid = texture.build_pyramid([texture.Base.of(b) for b in bases], [0] * len(bases))
     texels = np.array(pyramid.texels).reshape(-1, 8)
     for base, offsets in zip(bases, pyramid.layout.offsets, strict=True):
-        np.testing.assert_array_equal(texels[offsets[0] : offsets[0] + base[..., 0].size], base.reshape(-1, 8))
+        np.testing.assert_array_equal(
+            texels[offsets[0] : offsets[0] + base[..., 0].size], base.reshape(-1, 8)
+        )
 
 
 def test_many_meshes_are_written_in_groups(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -295,7 +319,9 @@ def test_many_meshes_are_written_in_groups(tmp_path: Path, monkeypatch: pytest.M
     save(Asset(tuple(meshes)), tmp_path / "x.usda")
     again = load(tmp_path / "x.usda").meshes
     assert [m.name for m in again] == [f"G{k}_m{k}" for k in range(8)]
-    np.testing.assert_allclose([m.positions for m in again], [m.positions for m in meshes], atol=1e-6)
+    np.testing.assert_allclose(
+        [m.positions for m in again], [m.positions for m in meshes], atol=1e-6
+    )
     assert (tmp_path / "x.usda").read_text().count('def Scope "Group') == 3
 
 

@@ -1,4 +1,5 @@
-"""Normals of files without: hard edges, smoothing groups, noise; what else PLY and STL files hold."""
+"""Normals of files without: hard edges, smoothing groups, noise; what else PLY and STL files
+hold."""
 
 from __future__ import annotations
 
@@ -24,7 +25,10 @@ from appearance_opt.latent.latent import LatentMesh
 
 def soup(faces: np.ndarray, attribute: np.ndarray | None = None, header: bytes = b"") -> bytes:
     """A binary STL file of (F, 3, 3) corners."""
-    rows = np.zeros(len(faces), np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")]))
+    rows = np.zeros(
+        len(faces),
+        np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")]),
+    )
     rows["corners"] = faces
     rows["attribute"] = 0 if attribute is None else attribute
     return header.ljust(80, b"\0") + struct.pack("<I", len(faces)) + rows.tobytes()
@@ -41,9 +45,16 @@ def written(folder: Path, kind: str, vertices: np.ndarray, faces: np.ndarray) ->
         corners = [f"f {a + 1} {b + 1} {c + 1}" for a, b, c in faces.tolist()]
         path.write_text("\n".join([*(f"v {r}" for r in rows), *corners]) + "\n")
         return path
-    head = ["ply", "format ascii 1.0", f"element vertex {len(rows)}", *(f"property float {a}" for a in "xyz")]
+    head = [
+        "ply",
+        "format ascii 1.0",
+        f"element vertex {len(rows)}",
+        *(f"property float {a}" for a in "xyz"),
+    ]
     head += [f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header"]
-    path.write_text("\n".join([*head, *rows, *(f"3 {a} {b} {c}" for a, b, c in faces.tolist())]) + "\n")
+    path.write_text(
+        "\n".join([*head, *rows, *(f"3 {a} {b} {c}" for a, b, c in faces.tolist())]) + "\n"
+    )
     return path
 
 
@@ -60,7 +71,9 @@ def test_the_edges_of_a_cube_are_hard(tmp_path: Path, kind: str) -> None:
     box = trimesh.creation.box()
     mesh = load(written(tmp_path, kind, box.vertices, box.faces)).meshes[0]
     assert len(mesh.positions) == 24
-    np.testing.assert_allclose(mesh.normals[mesh.faces], np.repeat(face_normals(mesh)[:, None], 3, 1), atol=1e-6)
+    np.testing.assert_allclose(
+        mesh.normals[mesh.faces], np.repeat(face_normals(mesh)[:, None], 3, 1), atol=1e-6
+    )
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -71,7 +84,8 @@ def test_a_cylinder_is_round_and_its_rims_are_hard(tmp_path: Path, kind: str) ->
     np.testing.assert_allclose(mesh.normals[mesh.faces[~side]][..., :2], 0, atol=1e-6)
     corner = mesh.faces[side].ravel()
     radial = mesh.positions[corner] * (1, 1, 0)
-    # the fans on both sides of a vertex weigh by their angles, which differ: 30 degrees lie between facets
+    # the fans on both sides of a vertex weigh by their angles, which differ: 30 degrees lie between
+    # facets
     assert (np.sum(mesh.normals[corner] * radial, axis=1) > np.cos(np.radians(10))).all()
     np.testing.assert_allclose(mesh.normals[corner][:, 2], 0, atol=1e-6)
 
@@ -86,7 +100,8 @@ def test_a_round_shape_stays_as_it_was(tmp_path: Path, kind: str) -> None:
 
 @pytest.mark.parametrize("deviation", [0.1, 0.2, 0.3])
 def test_a_noisy_scan_stays_smooth(deviation: float) -> None:
-    """Up to 40 % of its edges are sharper than the angle: without the rule for noise, there would be
+    """Up to 40 % of its edges are sharper than the angle: without the rule for noise, there would
+    be
     2.6 times the vertices in the last case."""
     ball = trimesh.creation.icosphere(4)
     noise = np.random.default_rng(0).normal(size=ball.vertices.shape)
@@ -118,7 +133,9 @@ def test_engraved_letters_are_hard() -> None:
     quads = [(k, k + 1, k + 1 + n, k + n) for k in range(n - 1)]
     faces = np.array([t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))])
     (mesh,) = add_normals([Mesh(p, faces.astype(np.int32))])
-    np.testing.assert_allclose(mesh.normals[mesh.faces], np.repeat(face_normals(mesh)[:, None], 3, 1), atol=1e-6)
+    np.testing.assert_allclose(
+        mesh.normals[mesh.faces], np.repeat(face_normals(mesh)[:, None], 3, 1), atol=1e-6
+    )
 
 
 def folded(angle: float) -> tuple[np.ndarray, np.ndarray]:
@@ -156,7 +173,10 @@ def test_smoothing_groups_of_obj_files(tmp_path: Path, statements: str, joined: 
     own = [face_normals(m)[0] for m in meshes]
     for k, smooth in enumerate(joined):
         shared = points[k + 1]
-        at = [m.normals[np.linalg.norm(m.positions - shared, axis=1) < 1e-6][0] for m in meshes[k : k + 2]]
+        at = [
+            m.normals[np.linalg.norm(m.positions - shared, axis=1) < 1e-6][0]
+            for m in meshes[k : k + 2]
+        ]
         if smooth:  # the squares weigh alike
             np.testing.assert_allclose(at, [unit(own[k] + own[k + 1])] * 2, atol=1e-6)
         else:
@@ -165,7 +185,9 @@ def test_smoothing_groups_of_obj_files(tmp_path: Path, statements: str, joined: 
 
 
 def test_normals_of_an_obj_file_stay(tmp_path: Path) -> None:
-    (tmp_path / "x.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nvn 1 0 0\ns off\nf 1//1 2//1 3//1\n")
+    (tmp_path / "x.obj").write_text(
+        "v 0 0 0\nv 1 0 0\nv 0 1 0\nvn 1 0 0\ns off\nf 1//1 2//1 3//1\n"
+    )
     np.testing.assert_array_equal(load(tmp_path / "x.obj").meshes[0].normals, [[1, 0, 0]] * 3)
 
 
@@ -174,10 +196,13 @@ def test_the_angle_may_be_given(tmp_path: Path, kind: str) -> None:
     rod = trimesh.creation.cylinder(1, 3, sections=12)
     path = written(tmp_path, kind, rod.vertices, rod.faces)
     counts = [len(load(path, crease_angle=a).meshes[0].positions) for a in (180, 80, 35, 25)]
-    # two centres; rims that are whole, or split into side and caps; and a pair of vertices for each facet
+    # two centres; rims that are whole, or split into side and caps; and a pair of vertices for each
+    # facet
     assert counts == [2 + 24, 2 + 48, 2 + 48, 2 + 24 + 48]
     flat = load(path, crease_angle=0).meshes[0]
-    np.testing.assert_allclose(flat.normals[flat.faces], np.repeat(face_normals(flat)[:, None], 3, 1), atol=1e-6)
+    np.testing.assert_allclose(
+        flat.normals[flat.faces], np.repeat(face_normals(flat)[:, None], 3, 1), atol=1e-6
+    )
     for wrong in (-1, 181, float("nan")):
         with pytest.raises(InputError, match=r"--crease-angle .* from 0 to 180"):
             load(path, crease_angle=wrong)
@@ -192,7 +217,12 @@ def test_the_angle_reaches_the_reader(tmp_path: Path) -> None:
         assert len(load_source(path, options).meshes[0].positions) == 26
     flat = load(path, crease_angle=180)
     assert compare(path, flat, views=1, resolution=32, samples=4).metrics.psnr_covered < 50
-    assert compare(path, flat, views=1, resolution=32, samples=4, crease_angle=180).metrics.psnr_covered == 99
+    assert (
+        compare(
+            path, flat, views=1, resolution=32, samples=4, crease_angle=180
+        ).metrics.psnr_covered
+        == 99
+    )
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -218,7 +248,9 @@ def test_hard_edges_do_not_tear_a_mesh() -> None:
     np.testing.assert_allclose(again.volume, 1, rtol=0.1)
     laid = unwrap_asset(Asset((mesh,), "x"), 64).meshes[0]
     corners = np.arange(len(laid.positions), dtype=np.int32)
-    latent = LatentMesh(laid.positions, laid.faces, corners, laid.faces, laid.uvs, laid.normals, None)
+    latent = LatentMesh(
+        laid.positions, laid.faces, corners, laid.faces, laid.uvs, laid.normals, None
+    )
     assert len(movable(latent).positions) == len(whole.positions)
 
 
@@ -248,8 +280,12 @@ def test_edges_join_only_faces_that_run_along_them_in_opposite_directions() -> N
     assert np.isfinite(mesh.normals).all()
     # a face without area divides its neighbours from itself alone
     flat = np.array([(0, 0, 0), (2, 0, 0), (1, 0, 0), (1, 1, 0), (1, -1, 0)], np.float32)
-    (mesh,) = add_normals([Mesh(flat, np.array([(0, 2, 3), (2, 1, 3), (0, 1, 2), (0, 4, 1)], np.int32))])
-    np.testing.assert_allclose(mesh.normals[mesh.faces[[0, 1, 3]]], np.tile((0, 0, 1), (3, 3, 1)), atol=1e-6)
+    (mesh,) = add_normals(
+        [Mesh(flat, np.array([(0, 2, 3), (2, 1, 3), (0, 1, 2), (0, 4, 1)], np.int32))]
+    )
+    np.testing.assert_allclose(
+        mesh.normals[mesh.faces[[0, 1, 3]]], np.tile((0, 0, 1), (3, 3, 1)), atol=1e-6
+    )
 
 
 @pytest.mark.parametrize("statement", ["s 1\n", ""])
@@ -265,7 +301,9 @@ def test_the_sides_of_a_sheet_are_smooth_each(tmp_path: Path, statement: str) ->
     mesh = load(tmp_path / "x.obj").meshes[0]
     assert len(mesh.positions) == 2 * len(points)
     radial = unit(mesh.positions.astype(np.float64) * (1, 0, 1))
-    inner = np.abs(mesh.positions[:, 2]) < np.cos(np.radians(10))  # at both ends there is half a fan only
+    inner = np.abs(mesh.positions[:, 2]) < np.cos(
+        np.radians(10)
+    )  # at both ends there is half a fan only
     assert (np.abs(np.sum(mesh.normals * radial, axis=1))[inner] > np.cos(np.radians(1))).all()
     own = face_normals(mesh)
     assert (np.einsum("fkc,fc->fk", mesh.normals[mesh.faces], own) > np.cos(np.radians(10))).all()
@@ -275,10 +313,19 @@ def test_other_attributes_go_with_the_vertices() -> None:
     box = trimesh.creation.box()
     uvs = np.random.default_rng(0).random((8, 2)).astype(np.float32)
     (mesh,) = add_normals(
-        [Mesh(box.vertices.astype(np.float32), box.faces.astype(np.int32), uvs=uvs, colors=uvs[:, [0] * 3])]
+        [
+            Mesh(
+                box.vertices.astype(np.float32),
+                box.faces.astype(np.int32),
+                uvs=uvs,
+                colors=uvs[:, [0] * 3],
+            )
+        ]
     )
     np.testing.assert_array_equal(mesh.uvs[mesh.faces], uvs[box.faces])
-    np.testing.assert_array_equal(mesh.positions[mesh.faces], box.vertices[box.faces].astype(np.float32))
+    np.testing.assert_array_equal(
+        mesh.positions[mesh.faces], box.vertices[box.faces].astype(np.float32)
+    )
     assert add_normals([mesh])[0] is mesh
     broken = Mesh(mesh.positions, mesh.faces + 99)
     assert add_normals([broken])[0] is broken
@@ -286,12 +333,19 @@ def test_other_attributes_go_with_the_vertices() -> None:
 
 @pytest.mark.parametrize("kind", ["float", "double"])
 def test_normals_of_a_ply_file_are_read(tmp_path: Path, kind: str) -> None:
-    head = ["ply", "format ascii 1.0", "element vertex 3", *(f"property {kind} {a}" for a in ("x", "y", "z"))]
+    head = [
+        "ply",
+        "format ascii 1.0",
+        "element vertex 3",
+        *(f"property {kind} {a}" for a in ("x", "y", "z")),
+    ]
     head += [*(f"property {kind} {a}" for a in ("nx", "ny", "nz")), "element face 1"]
     head += ["property list uchar int vertex_indices", "end_header"]
     rows = ["0 0 0 0 0 2", "1 0 0 0.6 0 0.8", "0 1 0 1 0 0", "3 0 1 2"]
     (tmp_path / "x.ply").write_text("\n".join([*head, *rows]) + "\n")
-    np.testing.assert_allclose(load(tmp_path / "x.ply").meshes[0].normals, [[0, 0, 1], [0.6, 0, 0.8], [1, 0, 0]])
+    np.testing.assert_allclose(
+        load(tmp_path / "x.ply").meshes[0].normals, [[0, 0, 1], [0.6, 0, 0.8], [1, 0, 0]]
+    )
     rows = ["0 0 0 0 0 0", "1 0 0 0 0 0", "0 1 0 0 0 0", "3 0 1 2"]
     (tmp_path / "x.ply").write_text("\n".join([*head, *rows]) + "\n")
     np.testing.assert_allclose(load(tmp_path / "x.ply").meshes[0].normals, [[0, 0, 1]] * 3)
@@ -302,7 +356,8 @@ RED, GREEN = 0b11111, 0b11111 << 5
 
 
 def facets(attribute: list[int], header: bytes, folder: Path) -> tuple[Asset, np.ndarray]:
-    """(asset, colours of the corners of the facets (F, 3, 3)) of a flat strip with these attributes."""
+    """(asset, colours of the corners of the facets (F, 3, 3)) of a flat strip with these
+    attributes."""
     p, quads = folded(0.0)
     faces = np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])[: len(attribute)]
     (folder / "x.stl").write_bytes(soup(p[faces], np.array(attribute), header))
@@ -318,12 +373,16 @@ def test_colours_of_viscam(tmp_path: Path) -> None:
     want = np.array([(0, 0, 1), (0, 1, 0), (1, 1, 1), (0, 0, srgb_to_linear(np.array(7 / 31)))])
     np.testing.assert_allclose(colors, np.repeat(want[:, None], 3, axis=1), atol=1e-6)
     # colours split vertices, but not the surface
-    np.testing.assert_allclose(asset.meshes[0].normals, np.tile((0, 0, 1), (len(asset.meshes[0].positions), 1)))
+    np.testing.assert_allclose(
+        asset.meshes[0].normals, np.tile((0, 0, 1), (len(asset.meshes[0].positions), 1))
+    )
 
 
 def test_colours_of_magics(tmp_path: Path) -> None:
     whole = 1 << 15
-    asset, colors = facets([RED, GREEN, whole, whole], b"a part COLOR=" + bytes([51, 102, 204, 128]), tmp_path)
+    asset, colors = facets(
+        [RED, GREEN, whole, whole], b"a part COLOR=" + bytes([51, 102, 204, 128]), tmp_path
+    )
     part = srgb_to_linear(np.array([51, 102, 204]) / 255)
     want = np.array([(1, 0, 0), (0, 1, 0), part, part])
     np.testing.assert_allclose(colors, np.repeat(want[:, None], 3, axis=1), atol=1e-6)
@@ -360,7 +419,9 @@ def test_binary_stl_files_whose_length_is_not_their_number(tmp_path: Path) -> No
 def test_text_stl_files_of_several_solids(tmp_path: Path) -> None:
     one = trimesh.creation.box().export(file_type="stl_ascii")
     for mark in ("", "\ufeff"):
-        (tmp_path / "x.stl").write_text(mark + one + one.upper().replace("\n", "\r\n"), encoding="utf-8")
+        (tmp_path / "x.stl").write_text(
+            mark + one + one.upper().replace("\n", "\r\n"), encoding="utf-8"
+        )
         assert load(tmp_path / "x.stl").triangle_count == 24
 
 

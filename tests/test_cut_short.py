@@ -20,11 +20,17 @@ def jpeg(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactor
         spec.attribute("jpeg:progressive", 1)
     out = oiio.ImageOutput.create(str(path))
     assert out.open(str(path), spec)
-    assert out.write_image(np.random.default_rng(0).integers(0, 256, (32, 48, 3), np.uint8).astype(np.uint8))
+    assert out.write_image(
+        np.random.default_rng(0).integers(0, 256, (32, 48, 3), np.uint8).astype(np.uint8)
+    )
     assert out.close()
     data = path.read_bytes()
     # an application segment that holds what looks like an end, as thumbnails do
-    return data[:2] + b"\xff\xe3\x00\x06\xff\xd9\xff\xd9" + data[2:] if request.param == "restarts" else data
+    return (
+        data[:2] + b"\xff\xe3\x00\x06\xff\xd9\xff\xd9" + data[2:]
+        if request.param == "restarts"
+        else data
+    )
 
 
 def test_jpeg_files_that_are_cut_short_are_refused(jpeg: bytes) -> None:

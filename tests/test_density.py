@@ -26,7 +26,8 @@ def areas(mesh: LatentMesh) -> NDArray[np.float64]:
 def test_charts_are_as_large_as_what_they_stand_for() -> None:
     charts = make_charts(5 * BALL.positions + 3, BALL.faces)
     np.testing.assert_array_equal(charts.frame_vertex[charts.frame_faces], BALL.faces)
-    # in units of the box's longest side, which is 2 of the ball's radii; charts of a sphere are stretched a little
+    # in units of the box's longest side, which is 2 of the ball's radii; charts of a sphere are
+    # stretched a little
     assert uv_areas(charts).sum() == pytest.approx(areas(BALL).sum() / 4, rel=0.1)
     label = charts_of(charts)
     assert label.min() == 0 and label.max() == len(np.unique(label)) - 1
@@ -66,7 +67,10 @@ def test_charts_are_as_far_apart_as_they_are_meant_to_be(gutter: int, tight: boo
     # texels between the nearest texels of any two charts, along rows or columns and diagonally
     far = SIZE * SIZE
     largest = [ndimage.maximum_filter(chart, 2 * k + 1) for k in range(gutter + 4)]
-    smallest = [ndimage.minimum_filter(np.where(chart < 0, far, chart), 2 * k + 1) for k in range(gutter + 4)]
+    smallest = [
+        ndimage.minimum_filter(np.where(chart < 0, far, chart), 2 * k + 1)
+        for k in range(gutter + 4)
+    ]
     meets = [((a >= 0) & (a != b)).any() for a, b in zip(largest, smallest, strict=True)]
     # a square of 2 k + 1 texels that touches two charts spans at most 2 k - 1 between them
     nearest = 2 * meets.index(True) - 1
@@ -90,7 +94,13 @@ def half_noisy(mesh: LatentMesh) -> dict[str, NDArray[np.float32]]:
     noisy = np.array(points.texel)[np.array(points.here.position)[0] > 0]
     value = np.full(SIZE * SIZE, 0.5, np.float32)
     value[noisy] = np.random.default_rng(0).random(len(noisy))
-    constant = {"roughness": 0.5, "metalness": 0.0, "normal_x": 0.0, "normal_y": 0.0, "normal_z": 1.0}
+    constant = {
+        "roughness": 0.5,
+        "metalness": 0.0,
+        "normal_x": 0.0,
+        "normal_y": 0.0,
+        "normal_z": 1.0,
+    }
     flat = {name: np.full((SIZE, SIZE), v, np.float32) for name, v in constant.items()}
     return {**dict.fromkeys(("red", "green", "blue"), value.reshape(SIZE, SIZE)), **flat}
 
@@ -104,12 +114,17 @@ def test_texels_go_where_they_are_seen_to_be_missing() -> None:
     for chart in range(label.max() + 1):
         assert np.ptp(scale[label == chart]) == 0
     # charts that lie on one side alone
-    left, right = ([c for c in range(label.max() + 1) if (s * x[label == c] > 0).all()] for s in (-1, 1))
+    left, right = (
+        [c for c in range(label.max() + 1) if (s * x[label == c] > 0).all()] for s in (-1, 1)
+    )
     assert left and right
     least = min(scale[label == c][0] for c in right)
     assert least > 2 * max(scale[label == c][0] for c in left)
     # the same everywhere: no chart needs more than another
-    plain = {**maps, **{n: np.full((SIZE, SIZE), 0.5, np.float32) for n in ("red", "green", "blue")}}
+    plain = {
+        **maps,
+        **{n: np.full((SIZE, SIZE), 0.5, np.float32) for n in ("red", "green", "blue")},
+    }
     np.testing.assert_array_equal(chart_scales(BALL, plain, sampler), 1.0)
 
 

@@ -165,7 +165,9 @@ def test_files_of_a_displaced_result(bumpy: Asset, tmp_path: Path) -> None:
     mesh = movable(prepare(base).mesh)
     codec = TexelCodec((DISPLACEMENT,), len(heights))
     layer = codec.layer(codec.encode({DISPLACEMENT: heights}))
-    again = np.array(Tessellator(mesh, 2, False)(mi.Float(mesh.positions.ravel()), layer)).reshape(-1, 3)
+    again = np.array(Tessellator(mesh, 2, False)(mi.Float(mesh.positions.ravel()), layer)).reshape(
+        -1, 3
+    )
     theirs = levels[2].meshes[0].positions
     distance = np.array([np.linalg.norm(theirs - p, axis=1).min() for p in again])
     # rounding of 16 bits: half of scale / 65535; measured 0.6 of it in the mean of a lookup
@@ -200,12 +202,20 @@ def test_what_is_not_there_has_no_parameter(bumpy: Asset, flat: SimplifyResult) 
     mesh = movable(prepare(result.asset).mesh)
     level = np.zeros((16, 16), np.float32)
     maps = {"red": level, "displacement": level}
-    assert set(Model(mesh, maps, frozenset({"displacement"}), Rates(), (1,)).parameters) == {DISPLACEMENT}
-    assert set(Model(mesh, maps, frozenset({"shape", "material"}), Rates(), (1,)).parameters) == {POSITIONS, TEXELS}
+    assert set(Model(mesh, maps, frozenset({"displacement"}), Rates(), (1,)).parameters) == {
+        DISPLACEMENT
+    }
+    assert set(Model(mesh, maps, frozenset({"shape", "material"}), Rates(), (1,)).parameters) == {
+        POSITIONS,
+        TEXELS,
+    }
 
 
-def test_the_closed_form_start_wins_back_the_bumps(flat: SimplifyResult, relief: SimplifyResult) -> None:
-    """Bumps that 200 triangles cannot have: distance of the drawn faces from the true surface, along the radius."""
+def test_the_closed_form_start_wins_back_the_bumps(
+    flat: SimplifyResult, relief: SimplifyResult
+) -> None:
+    """Bumps that 200 triangles cannot have: distance of the drawn faces from the true surface,
+    along the radius."""
     error = [_radial_error(flat.asset), _radial_error(relief.shown)]
     assert error[1] < error[0] / 4, error
 
@@ -217,7 +227,9 @@ def _radial_error(asset: Asset) -> float:
     return float(np.mean(np.abs(radius - bumps(centre / radius[:, None]))))
 
 
-def test_a_file_to_start_from_brings_its_triangles(bumpy: Asset, flat: SimplifyResult, tmp_path: Path) -> None:
+def test_a_file_to_start_from_brings_its_triangles(
+    bumpy: Asset, flat: SimplifyResult, tmp_path: Path
+) -> None:
     save(flat.asset, tmp_path / "bad.glb")
     o = simplify_options(init=str(tmp_path / "bad.glb"), displacement=True, subdivision=1, **QUICK)
     result = simplify(bumpy, tmp_path / "x.glb", o)
@@ -234,13 +246,20 @@ def test_changing_levels_compiles_nothing_after_the_first_steps(bumpy: Asset) ->
     model = Model(mesh, maps, frozenset({"shape", "material", DISPLACEMENT}), Rates(), (1, 2))
     validation = Validation(reference, sampler.held_out(1).draw(0, 2), 32)
     fit_options = FitOptions(steps=1000)
-    run = loop._Run(model, ReferencePool(reference, sampler, 8, 2, 32, 4), validation, fit_options, None, None)
+    run = loop._Run(
+        model, ReferencePool(reference, sampler, 8, 2, 32, 4), validation, fit_options, None, None
+    )
     assert settles(run)
-    levels = {loop.level_of(model.levels, fit_options.seed, run.state.iteration - k) for k in range(1, BLOCK + 1)}
+    levels = {
+        loop.level_of(model.levels, fit_options.seed, run.state.iteration - k)
+        for k in range(1, BLOCK + 1)
+    }
     assert levels == {1, 2}  # the clean steps changed levels
 
 
-def test_joint_bake_keeps_topology_and_texture_coordinates(bumpy: Asset, flat: SimplifyResult, tmp_path: Path) -> None:
+def test_joint_bake_keeps_topology_and_texture_coordinates(
+    bumpy: Asset, flat: SimplifyResult, tmp_path: Path
+) -> None:
     save(flat.asset, tmp_path / "low.glb")
     o = bake_options(joint=True, subdivision="2", samples=1, **QUICK)
     result = joint(bumpy, tmp_path / "low.glb", tmp_path / "out.usda", o)

@@ -64,13 +64,17 @@ def test_new_vertices_are_means_of_two_parents(level: int) -> None:
     mesh = ball()
     fine = tessellate(mesh, level)
     assert len(fine.mesh.faces) == len(mesh.faces) * 4**level
-    assert len(fine.mesh.positions) - len(fine.mesh.faces) // 2 == 2  # Euler's formula: still a sphere
+    assert (
+        len(fine.mesh.positions) - len(fine.mesh.faces) // 2 == 2
+    )  # Euler's formula: still a sphere
     np.testing.assert_array_equal(fine.mesh.positions[: len(mesh.positions)], mesh.positions)
     assert np.all(fine.weights.sum(axis=1) == 1)  # dyadic: exact
     if level:
         coarse = tessellate(mesh, level - 1).mesh
         p, fp = coarse.positions, fine.mesh.positions
-        corners = fine.mesh.faces.reshape(-1, 4, 3)  # children of each face; the middle one joins the midpoints
+        corners = fine.mesh.faces.reshape(
+            -1, 4, 3
+        )  # children of each face; the middle one joins the midpoints
         for k in range(3):
             mean = (p[coarse.faces[:, k]] + p[coarse.faces[:, (k + 1) % 3]]) / 2
             # the weights are exact, their three products are rounded once each: measured 1.2e-7
@@ -91,7 +95,9 @@ def test_texture_coordinates_stay_in_their_charts(level: int) -> None:
 
     # the children of a face tile its image in the atlas: same orientation, a fraction of its area
     np.testing.assert_allclose(
-        area(fine).reshape(len(mesh.faces), -1), np.repeat(area(mesh)[:, None] / 4**level, 4**level, 1), atol=1e-7
+        area(fine).reshape(len(mesh.faces), -1),
+        np.repeat(area(mesh)[:, None] / 4**level, 4**level, 1),
+        atol=1e-7,
     )
 
 
@@ -109,7 +115,9 @@ def test_no_crack_opens_at_any_level(level: int) -> None:
     assert (edge_uses(fine.frame_faces) == 1).any()  # there are seams to crack
     # and without the mean over a vertex's render vertices they would: its lookups do differ
     codec, stored = relief_of(noise())
-    value = codec.layer(stored).pyramid.lookup(None, mi.Point2f(fine.uvs.T), mi.Float(footprint(fine)))[0]
+    value = codec.layer(stored).pyramid.lookup(
+        None, mi.Point2f(fine.uvs.T), mi.Float(footprint(fine))
+    )[0]
     lone = p[fine.frame_vertex] + np.array(value)[:, None]
     assert (edge_uses(weld(lone.astype(np.float32))[1][fine.frame_faces]) == 1).any()
 
@@ -130,7 +138,9 @@ def test_displacement_follows_the_interpolated_normal() -> None:
 def test_vertices_read_the_mip_level_of_their_spacing() -> None:
     mesh = sphere(108, (0.0, 0.0, 0.0), 1.0, 256)
     y, x = np.meshgrid(np.arange(256), np.arange(256), indexing="ij")
-    finest = np.where((x + y) % 2, 0.2, -0.2).astype(np.float32)  # far finer than any edge: its mean is 0
+    finest = np.where((x + y) % 2, 0.2, -0.2).astype(
+        np.float32
+    )  # far finer than any edge: its mean is 0
     for level in (0, 1, 2):
         tessellator = Tessellator(mesh, level, tangents=False)
         fine = tessellator.topology.mesh
@@ -144,8 +154,12 @@ def test_vertices_read_the_mip_level_of_their_spacing() -> None:
     codec, stored = relief_of(broad)
     read = np.array(tessellator.amount(codec.layer(stored)))
     fine = tessellator.topology.mesh
-    expected = np.bincount(fine.frame_vertex, share(fine) * 0.2 * np.sin(2 * np.pi * (fine.uvs[:, 0] - 0.5 / 256)))
-    rim = np.bincount(fine.frame_vertex, np.abs(fine.uvs - 0.5).max(axis=1) > 0.5 - 2 / 256) > 0  # clamped lookups
+    expected = np.bincount(
+        fine.frame_vertex, share(fine) * 0.2 * np.sin(2 * np.pi * (fine.uvs[:, 0] - 0.5 / 256))
+    )
+    rim = (
+        np.bincount(fine.frame_vertex, np.abs(fine.uvs - 0.5).max(axis=1) > 0.5 - 2 / 256) > 0
+    )  # clamped lookups
     np.testing.assert_allclose(read[~rim], expected[~rim], atol=3e-4)  # measured 6e-5
 
 
@@ -158,8 +172,13 @@ def test_derivatives_of_the_displaced_surface(level: int, of: str) -> None:
     codec, stored = relief_of(smooth())
     rng = np.random.default_rng(level)
     fine = tessellator.topology.mesh
-    weights = [rng.normal(size=8 * n).astype(np.float32) for n in (len(fine.positions), len(fine.uvs))]
-    start = {POSITIONS: np.ascontiguousarray(mesh.positions).ravel(), DISPLACEMENT: np.array(stored)}
+    weights = [
+        rng.normal(size=8 * n).astype(np.float32) for n in (len(fine.positions), len(fine.uvs))
+    ]
+    start = {
+        POSITIONS: np.ascontiguousarray(mesh.positions).ravel(),
+        DISPLACEMENT: np.array(stored),
+    }
 
     def buffers(p: mi.Float, layer) -> tuple[mi.Float, mi.Float]:
         surface = tessellator.topology.surface(tessellator(p, layer))
@@ -167,8 +186,13 @@ def test_derivatives_of_the_displaced_surface(level: int, of: str) -> None:
 
     p, layer = mi.Float(start[POSITIONS]), codec.layer(stored)
     dr.enable_grad(p, layer.pyramid.texels)
-    dr.backward(sum(dr.sum(b * mi.Float(w)) for b, w in zip(buffers(p, layer), weights, strict=True)))
-    analytic = {POSITIONS: dr.grad(p), DISPLACEMENT: codec.pull_back(dr.grad(layer.pyramid.texels), stored)}
+    dr.backward(
+        sum(dr.sum(b * mi.Float(w)) for b, w in zip(buffers(p, layer), weights, strict=True))
+    )
+    analytic = {
+        POSITIONS: dr.grad(p),
+        DISPLACEMENT: codec.pull_back(dr.grad(layer.pyramid.texels), stored),
+    }
     slope = np.array(analytic[of]).astype(np.float64)
     assert np.linalg.norm(slope) > 0
     for _ in range(3):
@@ -178,29 +202,40 @@ def test_derivatives_of_the_displaced_surface(level: int, of: str) -> None:
             moved = {**start, of: start[of] + np.float32(sign * 1e-3) * direction}
             both = buffers(mi.Float(moved[POSITIONS]), codec.layer(mi.Float(moved[DISPLACEMENT])))
             # summed in double precision: the sum is far larger than its change
-            values.append(sum(np.array(b).astype(np.float64) @ w for b, w in zip(both, weights, strict=True)))
+            values.append(
+                sum(np.array(b).astype(np.float64) @ w for b, w in zip(both, weights, strict=True))
+            )
         numeric = (values[0] - values[1]) / 2e-3
         # measured 0.2 % of a typical direction's derivative, in float32
         assert abs(float(slope @ direction) - numeric) < 0.005 * np.linalg.norm(slope)
 
 
 def inside_view(count: int = 2):
-    """Cameras and lights inside a closed mesh: nothing but surface is seen, no silhouette moves, so that finite
-    differences of the image are smooth."""
+    """Cameras and lights inside a closed mesh: nothing but surface is seen, no silhouette moves, so
+    that finite differences of the image are smooth."""
     eyes = np.array([[0.05, 0.02, 0.0], [-0.05, 0.0, 0.03]])[:count]
     targets = np.array([[1.0, 0.3, 0.2], [-0.4, -1.0, 0.5]])[:count]
     return look_at(eyes, targets, 60.0, np.array([[0.2, 0.3, 0.1], [-0.2, 0.1, 0.3]])[:count], 2.0)
 
 
-def inside_model(fit: tuple[str, ...], level: int = 2, levels: tuple[int, ...] | None = None) -> Model:
+def inside_model(
+    fit: tuple[str, ...], level: int = 2, levels: tuple[int, ...] | None = None
+) -> Model:
     mesh = sphere(192, (0.0, 0.0, 0.0), 1.0, SIZE)
     flat = np.zeros((SIZE, SIZE), np.float32)
-    # maps that jump across a seam would move a step in the image with it, which no derivative of shading sees
+    # maps that jump across a seam would move a step in the image with it, which no derivative of
+    # shading sees
     inside = distance_transform_edt(texel_coverage(mesh, SIZE)) - 2
     fade = np.clip(inside / 6, 0, 1).astype(np.float32)
     wave = smooth(SIZE, 0.2) * fade
     maps = {"red": 0.5 + wave, "green": 0.4 - wave, "blue": flat + 0.3, "roughness": flat + 0.7}
-    maps.update(metalness=flat, normal_x=wave, normal_y=flat, normal_z=flat + 1, displacement=smooth(SIZE, 0.02) * fade)
+    maps.update(
+        metalness=flat,
+        normal_x=wave,
+        normal_y=flat,
+        normal_z=flat + 1,
+        displacement=smooth(SIZE, 0.02) * fade,
+    )
     return Model(mesh, maps, frozenset(fit), Rates(), levels or (level,))
 
 
@@ -233,7 +268,8 @@ def test_derivatives_of_the_image(of: str) -> None:
             values.append(run()[0])
         numeric = (values[0] - values[1]) / 1e-2
         predicted = float(slope @ direction)
-        # measured 0.001 % (positions, displacement), 0.002 % (texels) of the largest derivative of such a direction
+        # measured 0.001 % (positions, displacement), 0.002 % (texels) of the largest derivative of
+        # such a direction
         assert abs(predicted - numeric) < 2e-4 * np.linalg.norm(slope) * np.linalg.norm(direction)
 
 
@@ -241,10 +277,14 @@ def broad_direction(of: str, model: Model, seed: int) -> np.ndarray:
     rng = np.random.default_rng(seed)
     if of == POSITIONS:
         p = model.mesh.positions.astype(np.float64)
-        field = np.stack([np.sin(p @ rng.normal(scale=2, size=3) + rng.uniform(0, 6)) for _ in range(3)], axis=1)
+        field = np.stack(
+            [np.sin(p @ rng.normal(scale=2, size=3) + rng.uniform(0, 6)) for _ in range(3)], axis=1
+        )
         return (0.3 * field).astype(np.float32).ravel()
     y, x = np.meshgrid(np.arange(SIZE), np.arange(SIZE), indexing="ij")
-    waves = [np.sin(2 * np.pi * (a * x + b * y) / SIZE + c) for a, b, c in rng.uniform(-3, 3, (3, 3))]
+    waves = [
+        np.sin(2 * np.pi * (a * x + b * y) / SIZE + c) for a, b, c in rng.uniform(-3, 3, (3, 3))
+    ]
     if of == DISPLACEMENT:
         return (0.3 * waves[0]).astype(np.float32).ravel()
     assert model.codec is not None

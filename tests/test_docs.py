@@ -10,7 +10,9 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-SAMPLES = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "api.md").read_text(encoding="utf-8"), re.S)
+SAMPLES = re.findall(
+    r"```python\n(.*?)```", (ROOT / "docs" / "api.md").read_text(encoding="utf-8"), re.S
+)
 
 
 @pytest.mark.parametrize("sample", SAMPLES, ids=range(len(SAMPLES)))
@@ -22,7 +24,10 @@ def test_samples_run(sample: str) -> None:
 
 def test_links_lead_somewhere(tmp_path: Path) -> None:
     done = subprocess.run(
-        [sys.executable, "scripts/build_docs.py", str(tmp_path)], capture_output=True, text=True, cwd=ROOT
+        [sys.executable, "scripts/build_docs.py", str(tmp_path)],
+        capture_output=True,
+        text=True,
+        cwd=ROOT,
     )
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "design.html").is_file()
@@ -61,7 +66,9 @@ def test_files_and_functions_that_pages_name_are_there(name: str) -> None:
         if function:
             code = places[0].read_text(encoding="utf-8")
             last = function.split(".")[-1]
-            assert re.search(rf"^\s*(?:def|class) {last}\b|^{last}\b", code, re.M), f"{path}: {function}"
+            assert re.search(rf"^\s*(?:def|class) {last}\b|^{last}\b", code, re.M), (
+                f"{path}: {function}"
+            )
 
 
 def test_lines_of_pages_are_short() -> None:

@@ -24,7 +24,9 @@ def glowing(ball: Asset) -> Asset:
     pixels = np.zeros((64, 64, 3), np.uint8)
     pixels[:32] = (255, 255, 0)
     mesh = ball.meshes[0]
-    material = replace(mesh.material, emission=FACTOR, emission_texture=Texture(pixels, "srgb", ("clamp", "clamp")))
+    material = replace(
+        mesh.material, emission=FACTOR, emission_texture=Texture(pixels, "srgb", ("clamp", "clamp"))
+    )
     return replace(ball, meshes=(replace(mesh, material=material),))
 
 
@@ -48,7 +50,9 @@ def test_files_keep_it(tmp_path: Path, glowing: Asset, suffix: str, textured: bo
     again = load(tmp_path / f"x{suffix}").meshes[0].material
     np.testing.assert_allclose(again.emission, FACTOR, rtol=1e-6)
     if textured:
-        np.testing.assert_array_equal(again.emission_texture.pixels, mesh.material.emission_texture.pixels)
+        np.testing.assert_array_equal(
+            again.emission_texture.pixels, mesh.material.emission_texture.pixels
+        )
         assert again.emission_texture.color_space == "srgb"
     else:
         assert again.emission_texture is None
@@ -64,7 +68,9 @@ def test_files_without_it_have_none(tmp_path: Path, ball: Asset, suffix: str) ->
 
 
 @pytest.mark.parametrize("suffix", [".gltf", ".usda", ".obj"])
-def test_nothing_glows_without_the_texture_that_says_where(tmp_path: Path, glowing: Asset, suffix: str) -> None:
+def test_nothing_glows_without_the_texture_that_says_where(
+    tmp_path: Path, glowing: Asset, suffix: str
+) -> None:
     save(glowing, tmp_path / f"x{suffix}")
     for picture in tmp_path.rglob("*.png"):
         picture.unlink()
@@ -72,9 +78,12 @@ def test_nothing_glows_without_the_texture_that_says_where(tmp_path: Path, glowi
 
 
 def test_a_simplified_ball_glows_where_the_ball_does(glowing: Asset) -> None:
-    result = appearance_opt.simplify(glowing, None, appearance_opt.simplify_options("draft", triangles=300, **QUICK))
+    result = appearance_opt.simplify(
+        glowing, None, appearance_opt.simplify_options("draft", triangles=300, **QUICK)
+    )
     height, rgb = emitted(result.asset)
-    # at the poles a sample covers the whole width of the texture, and is read from coarse mip levels
+    # at the poles a sample covers the whole width of the texture, and is read from coarse mip
+    # levels
     upper, lower = (height > 0.15) & (height < 0.9), (height < -0.15) & (height > -0.9)
     np.testing.assert_allclose(rgb[upper, :2], np.tile(FACTOR[:2], (upper.sum(), 1)), rtol=0.02)
     assert np.abs(rgb[lower]).max() < 0.02 * FACTOR[0]
@@ -84,7 +93,9 @@ def test_a_simplified_ball_glows_where_the_ball_does(glowing: Asset) -> None:
 def test_the_same_glow_everywhere_needs_no_map(ball: Asset) -> None:
     mesh = ball.meshes[0]
     plain = replace(ball, meshes=(replace(mesh, material=replace(mesh.material, emission=FACTOR)),))
-    result = appearance_opt.simplify(plain, None, appearance_opt.simplify_options("draft", triangles=300, **QUICK))
+    result = appearance_opt.simplify(
+        plain, None, appearance_opt.simplify_options("draft", triangles=300, **QUICK)
+    )
     material = result.asset.meshes[0].material
     np.testing.assert_allclose(material.emission, FACTOR, rtol=1e-6)
     assert material.emission_texture is None
@@ -93,7 +104,9 @@ def test_the_same_glow_everywhere_needs_no_map(ball: Asset) -> None:
 @pytest.mark.parametrize("joint", [False, True])
 def test_baked_maps_hold_it(glowing: Asset, joint: bool) -> None:
     mesh = glowing.meshes[0]
-    low = replace(glowing, meshes=(replace(mesh, material=replace(mesh.material, emission=(0.0, 0.0, 0.0))),))
+    low = replace(
+        glowing, meshes=(replace(mesh, material=replace(mesh.material, emission=(0.0, 0.0, 0.0))),)
+    )
     if joint:
         from appearance_opt.jobs.joint import joint as bake_jointly
 
@@ -123,4 +136,6 @@ def test_usd_scales_of_textures_are_kept(tmp_path: Path, ball: Asset) -> None:
     save(replace(ball, meshes=(replace(mesh, material=material),)), tmp_path / "x.usda")
     again = load(tmp_path / "x.usda").meshes[0].material
     np.testing.assert_allclose(again.base_color, material.base_color, rtol=1e-6)
-    np.testing.assert_allclose((again.roughness, again.metalness, again.normal_scale), (0.75, 0.5, 0.8), rtol=1e-6)
+    np.testing.assert_allclose(
+        (again.roughness, again.metalness, again.normal_scale), (0.75, 0.5, 0.8), rtol=1e-6
+    )

@@ -16,10 +16,13 @@ FOREIGN = {"experiments.baking.blender_bake", "experiments.quality.blender_simpl
 """Run in Blender's own Python."""
 
 FILES = {
-    ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__").removesuffix(".__main__"): path
+    ".".join(path.relative_to(ROOT).with_suffix("").parts)
+    .removesuffix(".__init__")
+    .removesuffix(".__main__"): path
     for path in sorted((ROOT / "experiments").rglob("*.py"))
 }
-"""Every module by the name that ``python -m`` knows it by: a package stands for its ``__main__``, if it has one."""
+"""Every module by the name that ``python -m`` knows it by: a package stands for its ``__main__``,
+if it has one."""
 
 STARTED = """
 import contextlib, importlib, io, json, runpy, sys
@@ -67,7 +70,10 @@ def test_it_starts_and_shows_its_help(name: str) -> None:
     else:
         assert how is None
         # what takes no options must not read them past argparse
-        assert "sys.argv[1" not in FILES[name].read_text(encoding="utf-8").split('if __name__ == "__main__":')[0]
+        assert (
+            "sys.argv[1"
+            not in FILES[name].read_text(encoding="utf-8").split('if __name__ == "__main__":')[0]
+        )
 
 
 @pytest.mark.parametrize("name", sorted(FOREIGN))
@@ -76,8 +82,8 @@ def test_a_script_for_blender_compiles(name: str) -> None:
 
 
 def commands(text: str) -> list[tuple[str, list[str]]]:
-    """(module, flags) of every ``python -m experiments...`` in Markdown: a line of a block, or a span, which may go on
-    in the next line."""
+    """(module, flags) of every ``python -m experiments...`` in Markdown: a line of a block, or a
+    span, which may go on in the next line."""
     blocks = re.findall(r"^```\w*\n(.*?)^```|^ {4}(\S.*)$", text, re.S | re.M)
     lines = [line.split(" #")[0] for block in blocks for line in "\n".join(block).splitlines()]
     spans = re.findall(r"`([^`]+)`", re.sub(r"^```.*?^```", "", text, flags=re.S | re.M))
@@ -93,7 +99,9 @@ PLACES = [
 
 
 @pytest.mark.parametrize(
-    "place", [p for p in PLACES if commands(p.read_text("utf-8"))], ids=lambda p: p.parent.name + "/" + p.name
+    "place",
+    [p for p in PLACES if commands(p.read_text("utf-8"))],
+    ids=lambda p: p.parent.name + "/" + p.name,
 )
 def test_commands_in_documents_exist(place: Path) -> None:
     for module, flags in commands(place.read_text(encoding="utf-8")):
@@ -105,4 +113,8 @@ def test_commands_in_documents_exist(place: Path) -> None:
 def test_commands_are_found_where_documents_have_them() -> None:
     block = "```\npython -m experiments.a --x 1  # --no\n```\n"
     text = f"{block}\nsee `python -m experiments.b.c --y\n  --z-z 2` and\n\n    python -m experiments.d\n"
-    assert commands(text) == [("experiments.a", ["--x"]), ("experiments.d", []), ("experiments.b.c", ["--y", "--z-z"])]
+    assert commands(text) == [
+        ("experiments.a", ["--x"]),
+        ("experiments.d", []),
+        ("experiments.b.c", ["--y", "--z-z"]),
+    ]

@@ -35,14 +35,26 @@ SAMPLER = ViewSampler((0.0, 0.0, 0.0), 1.0, seed=1)
 
 
 def options(**values: object) -> SimplifyOptions:
-    base = {"triangles": 200, "texture_size": 64, "resolution": 48, "pool": 16, "views": 2, "steps": 6, "budget": None}
+    base = {
+        "triangles": 200,
+        "texture_size": 64,
+        "resolution": 48,
+        "pool": 16,
+        "views": 2,
+        "steps": 6,
+        "budget": None,
+    }
     return simplify_options(**{**base, **values})
 
 
-def make_fit(ball: Asset, fitted: tuple[str, ...] = ("shape", "normal", "material"), size: int = 64):
+def make_fit(
+    ball: Asset, fitted: tuple[str, ...] = ("shape", "normal", "material"), size: int = 64
+):
     reference = MeshReference(ball)
     mesh = sphere(300, (0.0, 0.0, 0.0), 0.9, size)
-    model = Model(mesh, random_maps(size, 0, True), frozenset(fitted), Rates(0.02, 0.01, 0.03, 0.02))
+    model = Model(
+        mesh, random_maps(size, 0, True), frozenset(fitted), Rates(0.02, 0.01, 0.03, 0.02)
+    )
     pool = ReferencePool(reference, SAMPLER, 16, 2, 48, 4)
     validation = Validation(reference, SAMPLER.held_out(1).draw(0, 3), 48)
     return model, pool, validation
@@ -50,7 +62,9 @@ def make_fit(ball: Asset, fitted: tuple[str, ...] = ("shape", "normal", "materia
 
 def test_a_fit_finds_a_painted_ball(ball: Asset) -> None:
     model, pool, validation = make_fit(ball)
-    result = fit(model, pool, validation, FitOptions(steps=300, quality=Quality(1.0, 4, 1), relative=False))
+    result = fit(
+        model, pool, validation, FitOptions(steps=300, quality=Quality(1.0, 4, 1), relative=False)
+    )
     # from random colours on a smaller sphere: measured 13.8 -> 27.1 dB
     assert result.curve[0].psnr < 15
     assert result.curve[-1].psnr > result.curve[0].psnr + 8
@@ -76,8 +90,12 @@ def test_what_is_not_fitted_does_not_exist(ball: Asset) -> None:
 @pytest.mark.parametrize("visibility", ["edges", "pairs"])
 def test_no_kernel_is_compiled_after_the_first_steps(ball: Asset, visibility: str) -> None:
     model, pool, validation = make_fit(ball)
-    looks = FIRST + LATER + 1  # a power of two: looks come in time, and the last one, which ends the fit, is left out
-    chosen = FitOptions(steps=4 * looks, quality=Quality(visibility=visibility), validate_every=1 / looks)
+    looks = (
+        FIRST + LATER + 1
+    )  # a power of two: looks come in time, and the last one, which ends the fit, is left out
+    chosen = FitOptions(
+        steps=4 * looks, quality=Quality(visibility=visibility), validate_every=1 / looks
+    )
     run = loop._Run(model, pool, validation, chosen, None, None)
     run.look()
     assert looks_settle(run, 4)
@@ -106,7 +124,9 @@ def test_resuming_goes_on_where_it_stopped(ball: Asset, tmp_path: Path, one_thre
     second, pool, validation = make_fit(ball)
     result = fit(second, pool, validation, o, None, Checkpointer(tmp_path, "x", True, 1e9))
     assert result.steps == 12
-    np.testing.assert_allclose(second.host_positions(), whole.host_positions(), rtol=0, atol=one_thread)
+    np.testing.assert_allclose(
+        second.host_positions(), whole.host_positions(), rtol=0, atol=one_thread
+    )
     with pytest.raises(InputError, match="another input or other options"):
         fit(second, pool, validation, o, None, Checkpointer(tmp_path, "y", True, 1e9))
 
@@ -136,13 +156,17 @@ def test_repeated_bad_gradients_stop_the_fit(ball: Asset, monkeypatch: pytest.Mo
     np.testing.assert_array_equal(model.host_positions(), start)
 
 
-def test_one_bad_gradient_is_skipped_and_counted(ball: Asset, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_one_bad_gradient_is_skipped_and_counted(
+    ball: Asset, monkeypatch: pytest.MonkeyPatch
+) -> None:
     model, pool, validation = make_fit(ball)
     poisoned = iter([True, False, False])
 
     def gradients(self: Gradients, inputs: StepInputs) -> tuple:
         loss, grads = whole(self, inputs)
-        return loss, {n: g * np.nan if n == TEXELS and next(poisoned) else g for n, g in grads.items()}
+        return loss, {
+            n: g * np.nan if n == TEXELS and next(poisoned) else g for n, g in grads.items()
+        }
 
     whole = Gradients.__call__
     monkeypatch.setattr(Gradients, "__call__", gradients)
@@ -160,8 +184,11 @@ def test_a_model_that_is_not_finite_is_named(ball: Asset) -> None:
         fit(model, pool, validation, FitOptions(steps=2))
 
 
-def test_an_interrupted_look_leaves_the_parameters(ball: Asset, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A look renders running means; Ctrl-C there must not make a checkpoint take them for the parameters."""
+def test_an_interrupted_look_leaves_the_parameters(
+    ball: Asset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A look renders running means; Ctrl-C there must not make a checkpoint take them for the
+    parameters."""
     model, pool, validation = make_fit(ball)
     kept: list[dict] = []
 
@@ -175,7 +202,12 @@ def test_an_interrupted_look_leaves_the_parameters(ball: Asset, monkeypatch: pyt
             return False
 
         def save(self, model: Model, state: FitState) -> None:
-            kept.append({n: (np.array(v), np.array(state.moments[n].mean)) for n, v in model.values().items()})
+            kept.append(
+                {
+                    n: (np.array(v), np.array(state.moments[n].mean))
+                    for n, v in model.values().items()
+                }
+            )
 
     looks = iter([None, KeyboardInterrupt, None])
     whole = Validation.psnr
@@ -187,7 +219,9 @@ def test_an_interrupted_look_leaves_the_parameters(ball: Asset, monkeypatch: pyt
         return whole(self, model)
 
     monkeypatch.setattr(Validation, "psnr", psnr)
-    result = fit(model, pool, validation, FitOptions(steps=8, validate_every=0.5), checkpointer=Keep())
+    result = fit(
+        model, pool, validation, FitOptions(steps=8, validate_every=0.5), checkpointer=Keep()
+    )
     assert result.interrupted and result.steps == 4
     value, mean = kept[-1][TEXELS]
     assert np.abs(value - mean).max() > 1e-4
@@ -203,7 +237,9 @@ def test_a_reference_of_another_shape_is_named(ball: Asset) -> None:
         def render(self, views, resolution: int, samples: int = 1) -> np.ndarray:
             return np.zeros((len(views), resolution, resolution, 3), np.float32)
 
-    with pytest.raises(ReferenceRenderError, match=r"shape \(4, 16, 16, 3\).*expected \(4, 16, 16, 4\)"):
+    with pytest.raises(
+        ReferenceRenderError, match=r"shape \(4, 16, 16, 3\).*expected \(4, 16, 16, 4\)"
+    ):
         ReferencePool(Square(), SAMPLER, 8, 4, 16, 1).draw(0)
 
 
@@ -239,7 +275,9 @@ def test_simplify_end_to_end(ball: Asset, tmp_path: Path) -> None:
     assert 'src="data:image/png' in page
     # self-contained: no address outside of the pictures, whose letters may spell anything
     assert "http" not in re.sub(r"base64,[A-Za-z0-9+/=]*", "", page).replace("http-equiv", "")
-    assert {"report.json", "view0_wireframe.png"} <= {p.name for p in (tmp_path / "report").iterdir()}
+    assert {"report.json", "view0_wireframe.png"} <= {
+        p.name for p in (tmp_path / "report").iterdir()
+    }
     assert result.fit.steps == 6
     compared = appearance_opt.compare(ball, low, views=2, resolution=64, samples=4)
     assert compared.metrics.psnr_covered > 25  # measured 31
@@ -251,10 +289,14 @@ def test_zero_steps_hand_out_the_start(ball: Asset) -> None:
     result = simplify(ball, None, options(steps=0))
     assert result.fit.steps == 0
     # exported texels outside of charts are filled again: geometry is what must be equal
-    np.testing.assert_array_equal(result.asset.meshes[0].positions, result.start.meshes[0].positions)
+    np.testing.assert_array_equal(
+        result.asset.meshes[0].positions, result.start.meshes[0].positions
+    )
 
 
-@pytest.mark.parametrize("value", [{"init": "sphere"}, {"fit": "material"}, {"fit": "shape", "background": "white"}])
+@pytest.mark.parametrize(
+    "value", [{"init": "sphere"}, {"fit": "material"}, {"fit": "shape", "background": "white"}]
+)
 def test_variations_of_the_job(ball: Asset, value: dict) -> None:
     result = simplify(ball, None, options(steps=3, **value))
     assert 0 < result.triangles <= 200
@@ -288,7 +330,11 @@ def test_good_starts_are_fitted_gently() -> None:
     assert rates[-1].base_color < 0.1 * rates[0].base_color
     # vertices turn the bumps around them: they are held back sooner than texels
     shares = [r.position / r.base_color for r in rates]
-    assert shares[0] == shares[3] == 1.0 and shares[3] > shares[4] > shares[5] > 0 and shares[-1] == shares[-2]
+    assert (
+        shares[0] == shares[3] == 1.0
+        and shares[3] > shares[4] > shares[5] > 0
+        and shares[-1] == shares[-2]
+    )
     # a short fit cannot afford the least rates
     hasty, shorter = (fit_policy(38.0, True, patience=p)[1] for p in (0.0, 0.5))
     assert rates[-2].base_color < shorter.base_color < hasty.base_color == hasty.position

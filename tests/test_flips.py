@@ -15,8 +15,11 @@ def qualities(p: np.ndarray, f: np.ndarray) -> np.ndarray:
     return quality(*(p[f[:, k]] for k in range(3)))
 
 
-def flipped(p: np.ndarray, f: list, kind: list | None = None, original: list | None = None) -> tuple[list, int]:
-    """``original``: faces over the same vertices whose planes the quadrics stand for; none by default."""
+def flipped(
+    p: np.ndarray, f: list, kind: list | None = None, original: list | None = None
+) -> tuple[list, int]:
+    """``original``: faces over the same vertices whose planes the quadrics stand for; none by
+    default."""
     p, f = np.asarray(p, float), np.asarray(f)
     kind = np.zeros(len(f)) if kind is None else np.array(kind)
     q = np.zeros((len(p), quadrics.SIZE))
@@ -43,7 +46,9 @@ def test_the_better_diagonal_of_a_kite() -> None:
     assert flipped(KITE, [(0, 3, 2), (1, 2, 3)])[1] == 0
 
 
-@pytest.mark.parametrize("reason", ["folded", "kinds", "winding", "branched", "there already", "not convex"])
+@pytest.mark.parametrize(
+    "reason", ["folded", "kinds", "winding", "branched", "there already", "not convex"]
+)
 def test_what_is_no_flat_pair_stays(reason: str) -> None:
     p, f, kind = list(KITE), [(0, 1, 2), (1, 0, 3)], [0, 0]
     if reason == "folded":
@@ -63,7 +68,8 @@ def test_what_is_no_flat_pair_stays(reason: str) -> None:
 
 
 def test_a_bend_stays() -> None:
-    """The diagonals lie ``height`` apart, over an area of 0.2: a share of 0.001 for 0.0005, and 0.01 for 0.005."""
+    """The diagonals lie ``height`` apart, over an area of 0.2: a share of 0.001 for 0.0005, and
+    0.01 for 0.005."""
     old = [(0, 1, 2), (1, 0, 3)]
     for height, count in [(0.0005, 1), (0.005, 0)]:
         p = [*KITE[:2], (0, 0.1, height), (0, -0.1, height)]
@@ -72,7 +78,8 @@ def test_a_bend_stays() -> None:
 
 @pytest.mark.parametrize(("height", "count"), [(0.005, 1), (0.03, 1), (0.1, 0)])
 def test_an_edge_across_the_original_surface_is_flipped(height: float, count: int) -> None:
-    """The original is bent along the other diagonal; the heights of the thinner triangles are 0.1 and more."""
+    """The original is bent along the other diagonal; the heights of the thinner triangles are 0.1
+    and more."""
     p, other = [*KITE[:2], (0, 0.1, height), (0, -0.1, height)], [(0, 3, 2), (1, 2, 3)]
     assert flipped(p, [(0, 1, 2), (1, 0, 3)], original=other)[1] == count
 
@@ -107,10 +114,14 @@ def test_a_flat_end_of_a_cylinder_has_no_slivers() -> None:
     i = np.arange(n)
     j = (i + 1) % n
     bands = [
-        np.concatenate([np.stack([i, j, j + n], 1), np.stack([i, j + n, i + n], 1)]) + k * n for k in range(rings - 1)
+        np.concatenate([np.stack([i, j, j + n], 1), np.stack([i, j + n, i + n], 1)]) + k * n
+        for k in range(rings - 1)
     ]
     top = (rings - 1) * n
-    caps = [np.stack([j, i, np.full(n, len(p) - 2)], 1), np.stack([i + top, j + top, np.full(n, len(p) - 1)], 1)]
+    caps = [
+        np.stack([j, i, np.full(n, len(p) - 2)], 1),
+        np.stack([i + top, j + top, np.full(n, len(p) - 1)], 1),
+    ]
     q, g = decimate(p, np.concatenate([*bands, *caps]), 300)
     flat = np.ptp(q[g][:, :, 2], axis=1) < 1e-3
     assert flat.sum() > 20

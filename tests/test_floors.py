@@ -1,4 +1,5 @@
-"""The one-way flow of docs/design.md, read from the imports: no floor knows of one above it, and no circle."""
+"""The one-way flow of docs/design.md, read from the imports: no floor knows of one above it, and no
+circle."""
 
 from __future__ import annotations
 
@@ -28,7 +29,8 @@ def modules() -> dict[str, Path]:
 
 
 def imports(path: Path, known: dict[str, Path], types: bool = False) -> set[str]:
-    """Modules of the package that a module imports, within functions, too; what only types need if ``types``."""
+    """Modules of the package that a module imports, within functions, too; what only types need if
+    ``types``."""
     found: set[str] = set()
 
     def walk(node: ast.AST) -> None:
@@ -49,7 +51,9 @@ def imports(path: Path, known: dict[str, Path], types: bool = False) -> set[str]
 
 def test_every_part_has_its_floor_and_none_looks_up() -> None:
     known = modules()
-    assert {"errors", "jobs.simplify"} <= imports(known["cli"], known)  # it sees those within functions
+    assert {"errors", "jobs.simplify"} <= imports(
+        known["cli"], known
+    )  # it sees those within functions
     floor = {part: number for number, parts in enumerate(FLOORS) for part in parts}
     assert {name.split(".")[0] for name in known} == set(floor)
     above = [

@@ -75,7 +75,9 @@ def test_crumpled_meshes_are_unfolded(seed: int) -> None:
     assert count == folds.folded(moved).sum() > 10
     assert folds.folded(q).sum() == 0
     # most of what was moved keeps most of its way
-    way = np.linalg.norm(q - p, axis=1)[p[:, 0] > 0] / np.linalg.norm(moved - p, axis=1)[p[:, 0] > 0]
+    way = (
+        np.linalg.norm(q - p, axis=1)[p[:, 0] > 0] / np.linalg.norm(moved - p, axis=1)[p[:, 0] > 0]
+    )
     assert np.median(way) >= 0.25
     assert way.max() < 1 + 1e-5
 
@@ -87,12 +89,16 @@ def test_triangles_without_area_are_never_folded() -> None:
 
 
 def fitted(ball: Asset, relative: bool) -> tuple[FitResult, int]:
-    """(result, folded triangles) of a fit whose vertices take far too large steps while its colours get better."""
+    """(result, folded triangles) of a fit whose vertices take far too large steps while its colours
+    get better."""
     sampler = ViewSampler((0.0, 0.0, 0.0), 1.0, seed=1)
     reference = MeshReference(ball)
     mesh = sphere(1200, (0.0, 0.0, 0.0), 0.95, 64)
     model = Model(
-        mesh, random_maps(64, 0, True), frozenset(("shape", "normal", "material")), Rates(0.2, 0.01, 0.1, 0.1)
+        mesh,
+        random_maps(64, 0, True),
+        frozenset(("shape", "normal", "material")),
+        Rates(0.2, 0.01, 0.1, 0.1),
     )
     pool = ReferencePool(reference, sampler, 16, 2, 48, 4)
     validation = Validation(reference, sampler.held_out(1).draw(0, 2), 48)
@@ -108,4 +114,6 @@ def test_a_fit_hands_out_no_folds_and_says_how_many_there_were(ball: Asset) -> N
     assert kept.best_step > 0
     assert folded == 0
     assert kept.unfolded > 0
-    assert f"{kept.unfolded} triangles that the fit had turned over were turned back" in kept.notes()
+    assert (
+        f"{kept.unfolded} triangles that the fit had turned over were turned back" in kept.notes()
+    )

@@ -41,12 +41,20 @@ def wavy_maps(size: int) -> dict[str, np.ndarray]:
     y, x = np.meshgrid(np.arange(size), np.arange(size), indexing="ij")
     wave = (np.sin(2 * np.pi * x / size) * np.cos(2 * np.pi * y / size)).astype(np.float32)
     maps = flat_maps(size)
-    for k, amount in (("red", 0.2), ("blue", 0.1), ("roughness", 0.2), ("metalness", 0.15), ("normal_x", 0.2)):
+    for k, amount in (
+        ("red", 0.2),
+        ("blue", 0.1),
+        ("roughness", 0.2),
+        ("metalness", 0.15),
+        ("normal_x", 0.2),
+    ):
         maps[k] = maps[k] + amount * wave
     return maps
 
 
-def make_model(triangles: int = 300, size: int = 32, fit: tuple[str, ...] = ("shape", "normal", "material")) -> Model:
+def make_model(
+    triangles: int = 300, size: int = 32, fit: tuple[str, ...] = ("shape", "normal", "material")
+) -> Model:
     mesh = sphere(triangles, (0.0, 0.0, 0.0), 0.7, size)
     return Model(mesh, wavy_maps(size), frozenset(fit), Rates())
 
@@ -54,7 +62,9 @@ def make_model(triangles: int = 300, size: int = 32, fit: tuple[str, ...] = ("sh
 def make_inputs(model: Model, grid: Grid, seed: int = 0) -> StepInputs:
     views = SAMPLER.draw(seed, grid.views)
     reference = to_device(np.random.default_rng(seed).random(grid.pixels * 4) * 0.5)
-    return StepInputs(views, Targets(reference), np.full((grid.views, 3), 0.4, np.float32), 0.0, 0.0, 3)
+    return StepInputs(
+        views, Targets(reference), np.full((grid.views, 3), 0.4, np.float32), 0.0, 0.0, 3
+    )
 
 
 def test_texel_gradients_agree_with_finite_differences() -> None:
@@ -67,7 +77,8 @@ def test_texel_gradients_agree_with_finite_differences() -> None:
     start = np.array(parameter.value)
     rng = np.random.default_rng(1)
     for _ in range(4):
-        # random directions over all texels and channels: the sum over millions of texels is well conditioned
+        # random directions over all texels and channels: the sum over millions of texels is well
+        # conditioned
         direction = rng.normal(size=start.shape).astype(np.float32)
         step = 1e-3
         values = []
@@ -76,8 +87,9 @@ def test_texel_gradients_agree_with_finite_differences() -> None:
             values.append(float(Gradients(model, grid, quality, loss, freeze=False)(inputs)[0][0]))
         numeric = (values[0] - values[1]) / (2 * step)
         predicted = float(analytic @ direction)
-        # measured 0.3 to 0.9 % of a typical direction's derivative. The loss is L2: under the log-sRGB loss
-        # pixels on the terminator, where n.l passes through zero, make differences jump by 5 %
+        # measured 0.3 to 0.9 % of a typical direction's derivative. The loss is L2: under the
+        # log-sRGB loss pixels on the terminator, where n.l passes through zero, make differences
+        # jump by 5 %
         assert abs(predicted - numeric) < 0.02 * np.linalg.norm(analytic)
 
 
@@ -94,7 +106,11 @@ def test_each_channel_has_its_own_correct_gradient(channel: str) -> None:
         inputs = make_inputs(model, grid, seed)
         parameter.value = mi.Float(start.ravel())
         _, grads = Gradients(model, grid, quality, loss, freeze=False)(inputs)
-        predicted.append(float(np.array(grads[TEXELS]).reshape(-1, codec.packed)[:, index].astype(np.float64).sum()))
+        predicted.append(
+            float(
+                np.array(grads[TEXELS]).reshape(-1, codec.packed)[:, index].astype(np.float64).sum()
+            )
+        )
         values = []
         for sign in (1, -1):
             moved = start.copy()
@@ -103,8 +119,9 @@ def test_each_channel_has_its_own_correct_gradient(channel: str) -> None:
             values.append(float(Gradients(model, grid, quality, loss, freeze=False)(inputs)[0][0]))
         numeric.append((values[0] - values[1]) / 2e-3)
     error = np.abs(np.subtract(predicted, numeric)) / np.sqrt(np.mean(np.square(predicted)))
-    # in some views a pixel crosses the terminator, where the loss has a kink, between the two differences; most agree
-    # to 0.03 % of a typical derivative, and a gradient that is off by 0.3 % is off in all views
+    # in some views a pixel crosses the terminator, where the loss has a kink, between the two
+    # differences; most agree to 0.03 % of a typical derivative, and a gradient that is off by 0.3 %
+    # is off in all views
     assert np.median(error) < 0.003
 
 
@@ -120,16 +137,22 @@ def coverage_derivative(density: float, samples: int) -> tuple[float, float]:
     surface = model.surface(positions)
     maps = model.maps(model.fitted_layer())
     quality = Quality(density, samples, 1)
-    batch = gradient.render(model.scene, surface, maps, model.topology.edges, records, grid, quality, 0)
+    batch = gradient.render(
+        model.scene, surface, maps, model.topology.edges, records, grid, quality, 0
+    )
     by_image = np.zeros((grid.pixels, 4), np.float32)
     by_image[:, 3] = 1
-    gradient.backward(gradient.surrogate(batch, surface, maps, model.topology.edges, mi.Float(by_image.ravel())))
+    gradient.backward(
+        gradient.surrogate(batch, surface, maps, model.topology.edges, mi.Float(by_image.ravel()))
+    )
     edge = float(np.array(dr.grad(positions)).astype(np.float64) @ start)
     areas = []
     for scale in (1.02, 0.98):
         model.parameters[POSITIONS].value = mi.Float(start * scale)
         model.update_scene()
-        image = deferred.render_image(model.scene, model.surface(model.positions()), maps, records, grid, 64)
+        image = deferred.render_image(
+            model.scene, model.surface(model.positions()), maps, records, grid, 64
+        )
         areas.append(float(np.array(image).reshape(-1, 4)[:, 3].sum()))
     return edge, (areas[0] - areas[1]) / 0.04
 
@@ -159,7 +182,9 @@ def test_normals_and_tangents_equal_the_exporters() -> None:
         moved[mesh.frame_vertex], expected[mesh.frame_vertex], mesh.uvs, mesh.frame_faces
     )
     frames = np.array(surface.frames).reshape(-1, 8)
-    np.testing.assert_allclose(frames[mesh.frame_faces][..., 4:7], tangents[faces][..., :3], atol=2e-4)
+    np.testing.assert_allclose(
+        frames[mesh.frame_faces][..., 4:7], tangents[faces][..., :3], atol=2e-4
+    )
     np.testing.assert_array_equal(frames[mesh.frame_faces][..., 2], tangents[faces][..., 3])
 
 
@@ -167,8 +192,12 @@ def test_mesh_operations_have_correct_derivatives() -> None:
     mesh = sphere(200, (0.0, 0.0, 0.0), 0.6, 64)
     topology = LatentTopology(mesh, tangents=True)
     rng = np.random.default_rng(3)
-    start = mesh.positions.ravel() + rng.normal(scale=0.02, size=mesh.positions.size).astype(np.float32)
-    weights = [rng.normal(size=8 * n).astype(np.float32) for n in (len(mesh.positions), len(mesh.uvs))]
+    start = mesh.positions.ravel() + rng.normal(scale=0.02, size=mesh.positions.size).astype(
+        np.float32
+    )
+    weights = [
+        rng.normal(size=8 * n).astype(np.float32) for n in (len(mesh.positions), len(mesh.uvs))
+    ]
 
     def value(p: mi.Float) -> mi.Float:
         s = topology.surface(p)
@@ -181,9 +210,11 @@ def test_mesh_operations_have_correct_derivatives() -> None:
     for _ in range(3):
         direction = rng.normal(size=start.shape).astype(np.float32)
         step = 2e-4
-        numeric = float((value(mi.Float(start + step * direction)) - value(mi.Float(start - step * direction)))[0]) / (
-            2 * step
-        )
+        numeric = float(
+            (value(mi.Float(start + step * direction)) - value(mi.Float(start - step * direction)))[
+                0
+            ]
+        ) / (2 * step)
         # measured 0.1 to 0.5 % in float32
         assert abs(float(analytic @ direction) - numeric) < 0.02 * np.linalg.norm(analytic)
 
@@ -196,17 +227,23 @@ def test_losses_are_zero_at_equality_and_have_correct_gradients(name: str) -> No
     loss, all_pixels = LOSSES[name], dr.arange(mi.UInt32, 16)
     background = np.array([[0.2, 0.3, 0.4]])
     target = Target.of(mi.Float(reference), background)
-    same, _ = image_loss(loss, Target.of(mi.Float(image), background), mi.Float(image), all_pixels, 16)
+    same, _ = image_loss(
+        loss, Target.of(mi.Float(image), background), mi.Float(image), all_pixels, 16
+    )
     assert (np.array(same) == 0).all()
     _, by_image = image_loss(loss, target, mi.Float(image), all_pixels, 16)
     direction = rng.normal(size=64).astype(np.float32)
     direction[3::4] = 0
     values = [
-        np.array(image_loss(loss, target, mi.Float(image + s * 1e-3 * direction), all_pixels, 16)[0]).sum()
+        np.array(
+            image_loss(loss, target, mi.Float(image + s * 1e-3 * direction), all_pixels, 16)[0]
+        ).sum()
         for s in (1, -1)
     ]
     # measured below 0.2 %
-    assert float(np.array(by_image) @ direction) == pytest.approx((values[0] - values[1]) / 2e-3, rel=0.01, abs=1e-5)
+    assert float(np.array(by_image) @ direction) == pytest.approx(
+        (values[0] - values[1]) / 2e-3, rel=0.01, abs=1e-5
+    )
 
 
 def test_log_srgb_l1_by_hand() -> None:
@@ -221,7 +258,9 @@ def test_pyramid_hands_gradients_down_to_all_texels() -> None:
     stored = codec.encode({k: np.full((8, 8), 0.5, np.float32) for k in codec.channels})
     total = codec.layout.texel_count * codec.packed
     gradient_of_all = np.zeros(total, np.float32)
-    gradient_of_all[codec.layout.offsets[0][-1] * codec.packed] = 1.0  # the single texel of the last level
+    gradient_of_all[codec.layout.offsets[0][-1] * codec.packed] = (
+        1.0  # the single texel of the last level
+    )
     down = np.array(codec.pull_back(mi.Float(gradient_of_all), stored)).reshape(8, 8, codec.packed)
     np.testing.assert_allclose(down[..., 0], 1 / 64, rtol=1e-6)
     np.testing.assert_array_equal(down[..., 1], 0)
@@ -242,9 +281,12 @@ def test_laplacian_is_scale_free_and_zero_at_the_start() -> None:
 
 
 def test_the_laplacian_leaves_alone_what_stands_still() -> None:
-    """Rounding in place of a zero gradient would become whole steps of Adam, which differ from run to run."""
+    """Rounding in place of a zero gradient would become whole steps of Adam, which differ from run
+    to run."""
     mesh = sphere(300, (0.0, 0.0, 0.0), 1.0, 16)
-    laplacian = Laplacian(mesh.positions, mesh.faces, local_edge_length(mesh.positions, mesh.faces), relative=True)
+    laplacian = Laplacian(
+        mesh.positions, mesh.faces, local_edge_length(mesh.positions, mesh.faces), relative=True
+    )
     moved = mesh.positions.copy()
     moved[0] += 0.1
     positions = mi.Float(moved.ravel())
@@ -262,21 +304,28 @@ def test_the_laplacian_leaves_alone_what_stands_still() -> None:
 
 def test_a_mesh_out_of_sight_has_no_gradient_and_breaks_nothing() -> None:
     mesh = sphere(100, (0.0, 0.0, 0.0), 0.5, 16)
-    away = LatentMesh(mesh.positions + np.float32(100), mesh.faces, mesh.frame_vertex, mesh.frame_faces, mesh.uvs)
+    away = LatentMesh(
+        mesh.positions + np.float32(100), mesh.faces, mesh.frame_vertex, mesh.frame_faces, mesh.uvs
+    )
     model = Model(away, flat_maps(16), frozenset(("shape", "normal", "material")), Rates())
     grid = Grid(2, 32)
-    value, grads = Gradients(model, grid, Quality(), LOSSES["log-srgb-l1"], freeze=False)(make_inputs(model, grid))
+    value, grads = Gradients(model, grid, Quality(), LOSSES["log-srgb-l1"], freeze=False)(
+        make_inputs(model, grid)
+    )
     assert np.isfinite(float(value[0]))
     assert all((np.array(g) == 0).all() for g in grads.values())
 
 
 @pytest.mark.parametrize("want_loss", [True, False])
-@pytest.mark.parametrize(("samples", "visibility"), [(1, "edges"), (2, "edges"), (2, "none"), (4, "none")])
+@pytest.mark.parametrize(
+    ("samples", "visibility"), [(1, "edges"), (2, "edges"), (2, "none"), (4, "none")]
+)
 def test_pixels_shaded_with_their_loss_have_the_gradient_of_the_whole_image(
     samples: int, visibility: str, want_loss: bool
 ) -> None:
-    """The shortcut for pixels of few samples against the path through the image. Without silhouettes some pixels are
-    covered in part. The gradient is the same whether the value of the loss is wanted or not."""
+    """The shortcut for pixels of few samples against the path through the image. Without
+    silhouettes some pixels are covered in part. The gradient is the same whether the value of the
+    loss is wanted or not."""
     model, grid = make_model(), Grid(2, 48)
     quality = Quality(1.0, 4, samples, sample_width=0.4, visibility=visibility)
     inputs = replace(make_inputs(model, grid, 1), want_loss=want_loss)
@@ -303,9 +352,12 @@ def test_pixels_shaded_with_their_loss_have_the_gradient_of_the_whole_image(
         assert np.linalg.norm(a - b) < 1e-6 * np.linalg.norm(b)
 
 
-@pytest.mark.parametrize(("levels", "visibility"), [((0,), "edges"), ((1, 2), "edges"), ((0,), "pairs")])
+@pytest.mark.parametrize(
+    ("levels", "visibility"), [((0,), "edges"), ((1, 2), "edges"), ((0,), "pairs")]
+)
 def test_frozen_steps_equal_traced_ones(levels: tuple[int, ...], visibility: str) -> None:
-    """Recorded kernels see what moves: vertices, texels, views, images, how many pixels are covered."""
+    """Recorded kernels see what moves: vertices, texels, views, images, how many pixels are
+    covered."""
     maps: dict = wavy_maps(32)
     parts = ["shape", "normal", "material"]
     if levels != (0,):
@@ -315,11 +367,15 @@ def test_frozen_steps_equal_traced_ones(levels: tuple[int, ...], visibility: str
     grid, loss = Grid(2, 48), LOSSES["log-srgb-l1"]
     regularizers = laplacians(model, relative=False)
     quality = Quality(visibility=visibility)
-    frozen, plain = (Gradients(model, grid, quality, loss, regularizers, freeze=f) for f in (True, False))
+    frozen, plain = (
+        Gradients(model, grid, quality, loss, regularizers, freeze=f) for f in (True, False)
+    )
     moments = {n: adam.moments_of(p) for n, p in model.parameters.items()}
     for k in range(8):
         model.select(levels[k % len(levels)])
-        inputs = replace(make_inputs(model, grid, k), laplacian_weight=0.1 * k, rate=1.0, want_loss=k % 3 == 0)
+        inputs = replace(
+            make_inputs(model, grid, k), laplacian_weight=0.1 * k, rate=1.0, want_loss=k % 3 == 0
+        )
         value, grads = frozen(inputs)
         expected, wanted = plain(inputs)
         assert (value is None) == (expected is None) == (k % 3 != 0)
@@ -344,19 +400,29 @@ def test_recordings_are_reused() -> None:
     recorded = gradients.recordings()
     for k in range(24, 36):
         gradients(make_inputs(model, grid, k))
-    # eight functions in twelve steps: 96 more if nothing were reused. Now and then two lists are equally long by
-    # chance, which is recorded anew: up to 10 times between the first dozen of steps and the second, 0 to 4 times from
-    # there to the third (measured)
+    # eight functions in twelve steps: 96 more if nothing were reused. Now and then two lists are
+    # equally long by chance, which is recorded anew: up to 10 times between the first dozen of
+    # steps and the second, 0 to 4 times from there to the third (measured)
     assert recorded >= 8
     assert gradients.recordings() <= recorded + 16
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_texels_to_pyramid_and_back(seed: int) -> None:
-    """The pyramid's gradient pulled back to the stored texels, against central differences in random directions;
-    colours are stored as roots, normals of any length mean unit ones. Measured 3e-4 of the derivative's scale."""
+    """The pyramid's gradient pulled back to the stored texels, against central differences in
+    random directions; colours are stored as roots, normals of any length mean unit ones. Measured
+    3e-4 of the derivative's scale."""
     random = np.random.default_rng(seed)
-    channels = ("red", "green", "blue", "roughness", "metalness", "normal_x", "normal_y", "normal_z")
+    channels = (
+        "red",
+        "green",
+        "blue",
+        "roughness",
+        "metalness",
+        "normal_x",
+        "normal_y",
+        "normal_z",
+    )
     codec = TexelCodec(channels, 16)
     stored = random.uniform(0.2, 0.9, 16 * 16 * 8)
     weight = random.normal(size=codec.layout.texel_count * 8)
@@ -368,14 +434,19 @@ def test_texels_to_pyramid_and_back(seed: int) -> None:
     for _ in range(4):
         direction = random.normal(size=len(stored))
         step = 1e-3
-        difference = (total(stored + step * direction) - total(stored - step * direction)) / (2 * step)
-        assert difference == pytest.approx(gradient @ direction, abs=2e-3 * np.linalg.norm(gradient))
+        difference = (total(stored + step * direction) - total(stored - step * direction)) / (
+            2 * step
+        )
+        assert difference == pytest.approx(
+            gradient @ direction, abs=2e-3 * np.linalg.norm(gradient)
+        )
     normals = gradient.reshape(-1, 8)[:, 5:] * stored.reshape(-1, 8)[:, 5:]
     assert np.abs(normals.sum(axis=1)).max() < 1e-5 * np.abs(gradient).max()
 
 
 def test_flat_normals_have_no_gradient_along_themselves() -> None:
-    """Not even by rounding: an optimiser that divides by the gradient's size would walk them at random."""
+    """Not even by rounding: an optimiser that divides by the gradient's size would walk them at
+    random."""
     codec = TexelCodec(("normal_x", "normal_y", "normal_z"), 4)
     stored = np.zeros((16, codec.packed), np.float32)
     stored[:, 2] = 1

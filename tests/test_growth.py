@@ -26,7 +26,14 @@ from appearance_opt.views import ViewSampler
 
 
 def options(**values: object) -> SimplifyOptions:
-    base = {"triangles": 200, "init": "sphere", "texture_size": 64, "resolution": 48, "pool": 16, "views": 2}
+    base = {
+        "triangles": 200,
+        "init": "sphere",
+        "texture_size": 64,
+        "resolution": 48,
+        "pool": 16,
+        "views": 2,
+    }
     return simplify_options(**{**base, "budget": None, **values})
 
 
@@ -41,12 +48,17 @@ def test_smoothing_inverts_the_laplacian_system(smoother: Smoother) -> None:
     smooth = np.array(smoother(mi.Float(mesh.positions.ravel()))).reshape(-1, 3).astype(np.float64)
     # (I + 3 L) applied by hand, edge by edge
     corners = mesh.faces.astype(np.int64)
-    pairs = np.unique(np.sort(np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]]), 1), axis=0)
+    pairs = np.unique(
+        np.sort(np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]]), 1),
+        axis=0,
+    )
     back = smooth.copy()
     for a, b in pairs:
         back[a] += 3 * (smooth[a] - smooth[b])
         back[b] += 3 * (smooth[b] - smooth[a])
-    np.testing.assert_allclose(back, mesh.positions, atol=2e-6)  # measured 4.5e-7: stored in single precision
+    np.testing.assert_allclose(
+        back, mesh.positions, atol=2e-6
+    )  # measured 4.5e-7: stored in single precision
 
 
 def test_smoothing_keeps_translations_and_is_its_own_adjoint(smoother: Smoother) -> None:
@@ -63,7 +75,9 @@ def test_preconditioned_steps_move_neighbours_together(smoother: Smoother) -> No
     n = len(sphere(300, (0.0, 0.0, 0.0), 1.0, 16).positions)
     gradient = np.zeros((n, 3), np.float32)
     gradient[7] = (0, 0, -1)  # one vertex alone wants to move
-    parameter = Parameter("positions", mi.Float(np.zeros(3 * n, np.float32)), 1, mi.Float(0.1), smooth=smoother)
+    parameter = Parameter(
+        "positions", mi.Float(np.zeros(3 * n, np.float32)), 1, mi.Float(0.1), smooth=smoother
+    )
     value, _ = adam.update(parameter, mi.Float(gradient.ravel()), adam.moments_of(parameter), 1.0)
     moved = np.array(value).reshape(-1, 3)
     assert (moved[:, 2] > 0).all() and np.argmax(moved[:, 2]) == 7
@@ -80,7 +94,10 @@ def test_a_grown_sphere_becomes_the_object(ball: Asset) -> None:
     result = simplify(target, None, options(steps=120))
     assert result.triangles <= 200
     # measured 24.4 dB, 42 + 78 steps, and 0.05 of the extent
-    assert appearance_opt.compare(target, result.asset, views=3, resolution=64).metrics.psnr_covered > 20
+    assert (
+        appearance_opt.compare(target, result.asset, views=3, resolution=64).metrics.psnr_covered
+        > 20
+    )
     extent = np.ptp(result.asset.meshes[0].positions, axis=0)
     np.testing.assert_allclose(extent, np.ptp(pear.positions, axis=0), atol=0.1)
 
@@ -90,7 +107,8 @@ def test_spheres_start_in_the_box_of_the_object() -> None:
     ball = sphere(300, (0.0, 0.0, 0.0), 1.0, 16)
     p = stretch(ball, ViewSampler((0.0, 0.0, 0.0), 10.0, 0, hull=corners)).positions
     np.testing.assert_allclose((p.min(0) + p.max(0)) / 2, (1.0, 4.0, 2.0), atol=1e-5)
-    # 95 % of the box, and a tenth of the radius where it is flat; 300 triangles reach the axes to 2 %
+    # 95 % of the box, and a tenth of the radius where it is flat; 300 triangles reach the axes to 2
+    # %
     np.testing.assert_allclose(np.ptp(p, axis=0), np.array([4.0, 8.0, 2.0]) * 0.95, rtol=0.03)
     p = stretch(ball, ViewSampler((1.0, 0.0, 0.0), 10.0, 0)).positions
     np.testing.assert_allclose(np.linalg.norm(p - (1.0, 0.0, 0.0), axis=1), 6.0, rtol=1e-5)
@@ -108,7 +126,8 @@ def test_a_spoilt_mesh_is_mended(ball: Asset, tmp_path: Path) -> None:
     result = simplify(ball, None, options(triangles=None, init=str(bad), steps=100, relative=False))
     assert result.triangles == len(mesh.faces)
     before, after = (
-        appearance_opt.compare(ball, x, views=3, resolution=64).metrics for x in (kept_shape.asset, result.asset)
+        appearance_opt.compare(ball, x, views=3, resolution=64).metrics
+        for x in (kept_shape.asset, result.asset)
     )
     assert after.silhouette_shift < 0.4 * before.silhouette_shift
     assert after.psnr_covered > before.psnr_covered + 5
@@ -118,7 +137,9 @@ def test_a_resumed_growth_goes_on_from_the_same_start(ball: Asset, tmp_path: Pat
     first = simplify(ball, None, options(steps=6), checkpoint=tmp_path)
     again = simplify(ball, None, options(steps=6), checkpoint=tmp_path, resume=True)
     for name in ("positions", "faces", "uvs"):
-        np.testing.assert_array_equal(getattr(first.start.meshes[0], name), getattr(again.start.meshes[0], name))
+        np.testing.assert_array_equal(
+            getattr(first.start.meshes[0], name), getattr(again.start.meshes[0], name)
+        )
     assert again.fit.steps == first.fit.steps
 
 

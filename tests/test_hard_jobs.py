@@ -28,24 +28,38 @@ from tests.test_hard_cases import SAMPLER, TRIANGLE, model_of
 
 
 def options(**values: object) -> SimplifyOptions:
-    base = {"triangles": 150, "texture_size": 32, "resolution": 32, "pool": 8, "views": 2, "steps": 4, "budget": None}
+    base = {
+        "triangles": 150,
+        "texture_size": 32,
+        "resolution": 32,
+        "pool": 8,
+        "views": 2,
+        "steps": 4,
+        "budget": None,
+    }
     return simplify_options(**{**base, **values})
 
 
 def moved(asset: Asset, scale: float = 1.0, offset: float = 0.0) -> Asset:
     change = lambda p: (p.astype(np.float64) * scale + offset).astype(np.float32)  # noqa: E731
-    return replace(asset, meshes=tuple(replace(m, positions=change(m.positions)) for m in asset.meshes))
+    return replace(
+        asset, meshes=tuple(replace(m, positions=change(m.positions)) for m in asset.meshes)
+    )
 
 
 def soup(positions: object, faces: object) -> Asset:
-    return Asset((Mesh(np.asarray(positions, np.float32), np.asarray(faces, np.int32).reshape(-1, 3)),))
+    return Asset(
+        (Mesh(np.asarray(positions, np.float32), np.asarray(faces, np.int32).reshape(-1, 3)),)
+    )
 
 
 @pytest.fixture(scope="module")
 def exact(ball: Asset) -> Asset:
     """Coordinates that single precision still holds exactly 1e5 away from the origin."""
     mesh = ball.meshes[0]
-    return replace(ball, meshes=(replace(mesh, positions=np.round(mesh.positions * 128) / np.float32(128)),))
+    return replace(
+        ball, meshes=(replace(mesh, positions=np.round(mesh.positions * 128) / np.float32(128)),)
+    )
 
 
 def test_no_threshold_depends_on_the_scale(exact: Asset, one_thread: float) -> None:
@@ -55,7 +69,9 @@ def test_no_threshold_depends_on_the_scale(exact: Asset, one_thread: float) -> N
         (scaled,) = simplify(moved(exact, scale), None, options()).asset.meshes
         np.testing.assert_array_equal(scaled.faces, mesh.faces)
         np.testing.assert_array_equal(scaled.uvs, mesh.uvs)
-        np.testing.assert_allclose(scaled.positions / np.float32(scale), mesh.positions, rtol=0, atol=one_thread)
+        np.testing.assert_allclose(
+            scaled.positions / np.float32(scale), mesh.positions, rtol=0, atol=one_thread
+        )
 
 
 def test_results_are_as_good_at_any_scale_and_place(exact: Asset) -> None:
@@ -78,7 +94,11 @@ def test_results_are_as_good_at_any_scale_and_place(exact: Asset) -> None:
     [
         pytest.param(soup(TRIANGLE, [0, 1, 2]), 1, id="one triangle"),
         pytest.param(soup([*TRIANGLE, [0, 0, 1]], [[0, 1, 2], [1, 0, 3]]), 2, id="two"),
-        pytest.param(soup([*TRIANGLE, [0, 0, 1]], [[0, 1, 2], [1, 0, 3], [2, 1, 3], [0, 2, 3]]), 4, id="tetrahedron"),
+        pytest.param(
+            soup([*TRIANGLE, [0, 0, 1]], [[0, 1, 2], [1, 0, 3], [2, 1, 3], [0, 2, 3]]),
+            4,
+            id="tetrahedron",
+        ),
         pytest.param(soup([*TRIANGLE, *TRIANGLE], [[0, 1, 2], [5, 4, 3]]), 2, id="double sheet"),
         pytest.param(soup([[-1, 0, 0], [1, 0, 0], [0, 2e-6, 0]], [0, 1, 2]), 1, id="sliver"),
     ],
@@ -119,14 +139,18 @@ class Images:
         return np.tile(np.float32(self.pixel), (len(views), resolution, resolution, 1))
 
 
-def fit_of(reference: object, mesh: LatentMesh, steps: int, **choices: object) -> tuple[Model, FitResult]:
+def fit_of(
+    reference: object, mesh: LatentMesh, steps: int, **choices: object
+) -> tuple[Model, FitResult]:
     model = model_of(mesh)
     pool = ReferencePool(reference, SAMPLER, 8, 2, 32, 4)
     validation = Validation(reference, SAMPLER.held_out(1).draw(0, 2), 32)
     return model, fit(model, pool, validation, FitOptions(steps=steps, **choices))
 
 
-@pytest.mark.parametrize("pixel", [(0, 0, 0, 0), (0, 0, 0, 1), (6e4, 6e4, 6e4, 1)], ids=["empty", "black", "blinding"])
+@pytest.mark.parametrize(
+    "pixel", [(0, 0, 0, 0), (0, 0, 0, 1), (6e4, 6e4, 6e4, 1)], ids=["empty", "black", "blinding"]
+)
 @pytest.mark.parametrize("loss", ["log-srgb-l1", "l2"])
 def test_references_without_anything_to_see(pixel: tuple, loss: str) -> None:
     model, result = fit_of(Images(pixel), sphere(100, (0.0, 0.0, 0.0), 0.7, 16), 4, loss=loss)
@@ -180,7 +204,9 @@ def test_a_fit_resumed_anywhere_ends_where_the_whole_one_does(
     result = fit(*second, chosen, None, Checkpointer(tmp_path, "x", True, 1e9))
     assert [p.step for p in result.curve] == [p.step for p in expected.curve]
     assert result.best_step == expected.best_step
-    np.testing.assert_allclose(second[0].host_positions(), whole[0].host_positions(), rtol=0, atol=one_thread)
+    np.testing.assert_allclose(
+        second[0].host_positions(), whole[0].host_positions(), rtol=0, atol=one_thread
+    )
 
 
 def test_a_truncated_checkpoint_is_refused(ball: Asset, tmp_path: Path) -> None:
@@ -196,8 +222,12 @@ def test_a_truncated_checkpoint_is_refused(ball: Asset, tmp_path: Path) -> None:
 def test_a_checkpoint_of_other_textures_is_refused(ball: Asset, tmp_path: Path) -> None:
     simplify(ball, None, options(), checkpoint=tmp_path)
     m = ball.meshes[0]
-    other = replace(m.material.base_color_texture, pixels=255 - m.material.base_color_texture.pixels)
-    painted = Asset((replace(m, material=replace(m.material, base_color_texture=other)),), ball.name)
+    other = replace(
+        m.material.base_color_texture, pixels=255 - m.material.base_color_texture.pixels
+    )
+    painted = Asset(
+        (replace(m, material=replace(m.material, base_color_texture=other)),), ball.name
+    )
     with pytest.raises(InputError, match="another input"):
         simplify(painted, None, options(), checkpoint=tmp_path, resume=True)
 
@@ -217,5 +247,11 @@ def test_an_interrupted_fit_hands_out_what_it_reached(ball: Asset) -> None:
     reference = MeshReference(ball)
     pool = ReferencePool(reference, SAMPLER, 8, 2, 32, 4)
     model.set_rates(Rates(0.02, 0.01, 0.03, 0.02))
-    result = fit(model, pool, Validation(reference, SAMPLER.held_out(1).draw(0, 2), 32), FitOptions(steps=900), Stop())
+    result = fit(
+        model,
+        pool,
+        Validation(reference, SAMPLER.held_out(1).draw(0, 2), 32),
+        FitOptions(steps=900),
+        Stop(),
+    )
     assert result.interrupted and result.best_step == 20

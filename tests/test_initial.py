@@ -34,7 +34,8 @@ def test_a_sphere_keeps_its_shape_and_stays_closed(budget: int) -> None:
     assert budget - 2 < len(f) <= budget
     low = trimesh.Trimesh(p, f, process=False)
     assert low.is_watertight
-    # measured 99.6 % at 1000 triangles, 80 % at 20 (an icosahedron inscribed in the sphere has 61 %)
+    # measured 99.6 % at 1000 triangles, 80 % at 20 (an icosahedron inscribed in the sphere has 61
+    # %)
     expected = {1000: 0.99, 333: 0.98, 64: 0.9, 20: 0.7}[budget] * 4.19
     assert expected < volume(p, f) < 1.06 * 4.19
 
@@ -54,7 +55,9 @@ def test_degenerate_and_disconnected_input_survives() -> None:
     parts = [np.asarray(box.vertices) + rng.normal(size=3) * 5 for _ in range(12)]
     p = np.concatenate(parts)
     f = np.concatenate([np.asarray(box.faces) + k * len(box.vertices) for k in range(12)])
-    three = np.array([[0, 1, 600], [0, 1, 700], [5, 5, 6]])  # non-manifold fins and a degenerate face
+    three = np.array(
+        [[0, 1, 600], [0, 1, 700], [5, 5, 6]]
+    )  # non-manifold fins and a degenerate face
     q, g = decimate(p, np.concatenate([f, three]), 100)
     assert 0 < len(g) <= 100
     assert np.isfinite(q).all()
@@ -77,7 +80,8 @@ def test_a_mesh_that_lies_twice_at_one_place_costs_no_more_than_once() -> None:
 
 @pytest.mark.parametrize("budget", [20, 8, 2])
 def test_a_fan_around_one_edge_reaches_its_budget(budget: int) -> None:
-    """No collapse keeps the topology where all triangles share an edge, and there is no smaller part to drop."""
+    """No collapse keeps the topology where all triangles share an edge, and there is no smaller
+    part to drop."""
     angle = np.linspace(0, 2 * np.pi, 40, endpoint=False)
     rim = np.stack([np.cos(angle), np.sin(angle), np.zeros(40)], axis=1)
     p = np.concatenate([[(0, 0, -1), (0, 0, 1)], rim])
@@ -93,11 +97,15 @@ def test_small_parts_go_before_the_large_one_suffers(budget: int, kept: float) -
     places *= 1.1 / np.linalg.norm(places, axis=1, keepdims=True)
     beads = [0.02 * np.asarray(bead.vertices) + x for x in places]
     p = np.concatenate([ball.positions, *beads])
-    faces = [np.asarray(bead.faces) + len(ball.positions) + k * len(bead.vertices) for k in range(len(beads))]
+    faces = [
+        np.asarray(bead.faces) + len(ball.positions) + k * len(bead.vertices)
+        for k in range(len(beads))
+    ]
     q, g = decimate(p, np.concatenate([ball.faces, *faces]), budget)
     assert budget - 4 < len(g) <= budget
     largest = max(trimesh.Trimesh(q, g, process=False).split(), key=lambda part: part.area)
-    # 120 beads of at least four triangles each leave nothing of a ball at the lower budget, and 220 at the higher
+    # 120 beads of at least four triangles each leave nothing of a ball at the lower budget, and 220
+    # at the higher
     assert largest.volume > kept * 4.19
 
 
@@ -161,15 +169,20 @@ def test_transfer_onto_the_same_shape_looks_the_same(ball: Asset) -> None:
 
 
 def box_on_a_plinth() -> Asset:
-    """Two closed boxes that touch in the square |x|, |z| < 0.5 at y = 0: noise there, smooth colours elsewhere."""
+    """Two closed boxes that touch in the square |x|, |z| < 0.5 at y = 0: noise there, smooth
+    colours elsewhere."""
     rng = np.random.default_rng(0)
     meshes = []
     for size, y in (((2.0, 1.0, 2.0), -0.5), ((1.0, 1.0, 1.0), 0.5)):
         box = trimesh.creation.box(size).subdivide().subdivide().subdivide()
         p = (box.vertices + (0, y, 0)).astype(np.float32)
         touching = (p[:, 1] == 0) & (np.abs(p[:, [0, 2]]).max(axis=1) < 0.5)
-        colors = np.where(touching[:, None], rng.integers(0, 2, p.shape), (p + 2) / 4).astype(np.float32)
-        meshes.append(Mesh(p, box.faces.astype(np.int32), colors=colors, material=Material(roughness=0.5)))
+        colors = np.where(touching[:, None], rng.integers(0, 2, p.shape), (p + 2) / 4).astype(
+            np.float32
+        )
+        meshes.append(
+            Mesh(p, box.faces.astype(np.int32), colors=colors, material=Material(roughness=0.5))
+        )
     return Asset(tuple(meshes))
 
 
@@ -178,7 +191,9 @@ def test_texels_that_nobody_sees_are_filled_smoothly() -> None:
     first, place = weld(reference.merged.positions)
     mesh = unwrap(reference.merged.positions[first], place[reference.merged.faces], 128)
     plain, filled = (transfer(reference, mesh, 128, fill_hidden=f) for f in (False, True))
-    before, after = (np.stack([r.maps[c] for c in ("red", "green", "blue")], axis=-1) for r in (plain, filled))
+    before, after = (
+        np.stack([r.maps[c] for c in ("red", "green", "blue")], axis=-1) for r in (plain, filled)
+    )
     points = TexelPoints(mesh, 128).band(0, 0.5, 0.5)
     assert points is not None
     x, y, z = np.abs(np.array(points.here.position))
@@ -187,11 +202,14 @@ def test_texels_that_nobody_sees_are_filled_smoothly() -> None:
     assert touching.sum() > 100
     np.testing.assert_array_equal(filled.hidden.ravel(), touching)
     assert plain.hidden.sum() == 0
-    assert filled.missed.sum() < 0.01 * filled.covered.sum()  # none, or two where charts lie otherwise
+    assert (
+        filled.missed.sum() < 0.01 * filled.covered.sum()
+    )  # none, or two where charts lie otherwise
     seen = filled.covered & ~filled.hidden
     np.testing.assert_array_equal(after[seen], before[seen])
-    # what is filled varies slowly between neighbours. A chart that nobody sees takes its colours from whatever lies
-    # beside it: with nine ways of packing, steps are 5 to 7 % of the noise in the mean, the largest one 5 to 15 %
+    # what is filled varies slowly between neighbours. A chart that nobody sees takes its colours
+    # from whatever lies beside it: with nine ways of packing, steps are 5 to 7 % of the noise in
+    # the mean, the largest one 5 to 15 %
     both = filled.hidden[:, 1:] & filled.hidden[:, :-1]
     noise, left = (np.abs(np.diff(x, axis=1))[both] for x in (before, after))
     assert noise.mean() > 0.03  # 0.1

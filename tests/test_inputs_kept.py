@@ -1,4 +1,5 @@
-"""Inputs are never replaced, whatever they consist of; what cannot be written is refused before any work."""
+"""Inputs are never replaced, whatever they consist of; what cannot be written is refused before any
+work."""
 
 from __future__ import annotations
 
@@ -48,26 +49,44 @@ def Xform "S" (
 
 
 def quick(**values: object) -> SimplifyOptions:
-    base = {"triangles": 2, "steps": 0, "texture_size": 32, "resolution": 32, "pool": 4, "views": 2, "budget": None}
+    base = {
+        "triangles": 2,
+        "steps": 0,
+        "texture_size": 32,
+        "resolution": 32,
+        "pool": 4,
+        "views": 2,
+        "budget": None,
+    }
     return simplify_options(**{**base, **values})
 
 
 def contents(folder: Path) -> dict[str, bytes]:
-    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+    return {
+        str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()
+    }
 
 
 @pytest.fixture
 def scene(tmp_path: Path) -> Path:
-    """A stage of layers: one that it shows, one of a variant that is not chosen, and a picture that nothing shows."""
+    """A stage of layers: one that it shows, one of a variant that is not chosen, and a picture that
+    nothing shows."""
     for name in ("geo", "far"):
-        (tmp_path / f"{name}.usda").write_text(f'#usda 1.0\n( defaultPrim = "G" )\ndef Xform "G"\n{{\n{MESH}}}\n')
+        (tmp_path / f"{name}.usda").write_text(
+            f'#usda 1.0\n( defaultPrim = "G" )\ndef Xform "G"\n{{\n{MESH}}}\n'
+        )
     (tmp_path / "scene.usda").write_text(SCENE)
     (tmp_path / "extra.png").write_bytes(b"no picture")
     return tmp_path
 
 
 def test_files_of_a_stage_are_known(scene: Path) -> None:
-    assert {p.name for p in load(scene / "scene.usda").files} == {"scene.usda", "geo.usda", "far.usda", "extra.png"}
+    assert {p.name for p in load(scene / "scene.usda").files} == {
+        "scene.usda",
+        "geo.usda",
+        "far.usda",
+        "extra.png",
+    }
 
 
 @pytest.mark.parametrize("name", ["geo.usda", "far.usda"])
@@ -94,7 +113,9 @@ def test_files_that_nothing_shows_are_known(tmp_path: Path) -> None:
     text["buffers"].append({"uri": "other.bin", "byteLength": 1})
     (tmp_path / "a.gltf").write_text(json.dumps(text))
     assert {"other one.png", "other.bin"} <= {p.name for p in load(tmp_path / "a.gltf").files}
-    (tmp_path / "a.mtl").write_text("newmtl a\nKd 1 1 1\nnewmtl b\nrefl -type sphere m.png\ndisp -mm 0 1 n.png\n")
+    (tmp_path / "a.mtl").write_text(
+        "newmtl a\nKd 1 1 1\nnewmtl b\nrefl -type sphere m.png\ndisp -mm 0 1 n.png\n"
+    )
     (tmp_path / "a.obj").write_text("mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl a\nf 1 2 3\n")
     assert {"a.obj", "a.mtl", "m.png", "n.png"} <= {p.name for p in load(tmp_path / "a.obj").files}
 
@@ -115,10 +136,14 @@ def test_tessellated_levels_do_not_replace_an_input(tmp_path: Path) -> None:
 def test_reports_do_not_replace_pictures_of_an_input(ball: Asset, tmp_path: Path) -> None:
     save(ball, tmp_path / "a.gltf")
     (tmp_path / "a_0.png").rename(tmp_path / "view0_reference.png")
-    (tmp_path / "a.gltf").write_text((tmp_path / "a.gltf").read_text().replace("a_0.png", "view0_reference.png"))
+    (tmp_path / "a.gltf").write_text(
+        (tmp_path / "a.gltf").read_text().replace("a_0.png", "view0_reference.png")
+    )
     before = contents(tmp_path)
     with pytest.raises(InputError, match=r"could replace '.*view0_reference\.png'"):
-        appearance_opt.simplify(tmp_path / "a.gltf", tmp_path / "new" / "b.glb", quick(), report=tmp_path)
+        appearance_opt.simplify(
+            tmp_path / "a.gltf", tmp_path / "new" / "b.glb", quick(), report=tmp_path
+        )
     with pytest.raises(InputError, match=r"could replace '.*view0_reference\.png'"):
         appearance_opt.compare(tmp_path / "a.gltf", ball, out=tmp_path)
     assert contents(tmp_path) == before
@@ -151,7 +176,9 @@ def test_names_that_are_too_long_are_refused_before_any_work(tmp_path: Path) -> 
     assert not list(tmp_path.iterdir())
 
 
-def test_a_disk_without_room_is_refused_before_any_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_disk_without_room_is_refused_before_any_work(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(paths.shutil, "disk_usage", lambda _: SimpleNamespace(free=1 << 20))
     outputs = Outputs.of(tmp_path / "new" / "x.glb")
     outputs.check_room(100, quick())
@@ -174,7 +201,9 @@ def test_a_second_run_into_one_place_says_so(ball: Asset, tmp_path: Path, shared
     assert not list(tmp_path.iterdir())
 
 
-def test_loose_maps_and_result_appear_together(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_loose_maps_and_result_appear_together(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     from appearance_opt.jobs import bake
 
     def full(*_: object) -> None:

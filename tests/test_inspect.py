@@ -18,7 +18,8 @@ from tests.test_cli import run
 
 
 def glass_and_wood() -> Asset:
-    """A ball of 3 m across, and a smaller one that can be seen through, of which 5 faces are turned over."""
+    """A ball of 3 m across, and a smaller one that can be seen through, of which 5 faces are turned
+    over."""
     positions, faces = (np.array(a) for a in ball(1))
     uvs = np.abs(positions[:, :2])
     color = Texture(np.zeros((4, 8, 3), np.uint8), "srgb")
@@ -39,8 +40,14 @@ def test_what_an_artist_wants_to_know(tmp_path: Path) -> None:
     _, faces = ball(1)
     size = np.ptp(asset.meshes[0].positions, axis=0)
     np.testing.assert_allclose(found.size, size, rtol=1e-6)
-    assert found.files == 4 and found.file_bytes == sum(f.stat().st_size for f in tmp_path.iterdir())
-    assert (found.meshes, found.counts.triangles, found.counts.connected_parts) == (2, 2 * len(faces), 2)
+    assert found.files == 4 and found.file_bytes == sum(
+        f.stat().st_size for f in tmp_path.iterdir()
+    )
+    assert (found.meshes, found.counts.triangles, found.counts.connected_parts) == (
+        2,
+        2 * len(faces),
+        2,
+    )
     assert found.counts.reversed_normals == 5
     assert found.textures == 2 and found.texture_bytes == 4 * 8 * 3 + 16 * 16 * 3 * 2
     wood, glass = sorted(found.materials, key=lambda m: m.name, reverse=True)
@@ -62,7 +69,11 @@ def test_skins_clips_and_variants_of_both_formats(tmp_path: Path) -> None:
     )
     write_glb(tmp_path / "x.glb", given, binary)
     contents = appearance_opt.inspect(tmp_path / "x.glb").contents
-    assert contents.skins == ("skin0", "rig") and contents.clips == ("walk",) and contents.variants == ("red", "blue")
+    assert (
+        contents.skins == ("skin0", "rig")
+        and contents.clips == ("walk",)
+        and contents.variants == ("red", "blue")
+    )
     stage = """#usda 1.0
 (
     defaultPrim = "a"
@@ -104,7 +115,13 @@ def test_the_terminal_has_80_columns_and_long_lists_are_counted(tmp_path: Path) 
     picture = Texture(np.zeros((2, 2, 3), np.uint8), "srgb")
     name = "a material with a name that goes on and on, as names of materials do " * 3
     meshes = [
-        Mesh(positions + np.float32(3 * k), faces, positions, name=f"m{k}", material=replace(m, name=f"{name}{k}"))
+        Mesh(
+            positions + np.float32(3 * k),
+            faces,
+            positions,
+            name=f"m{k}",
+            material=replace(m, name=f"{name}{k}"),
+        )
         for k in range(LISTED + 5)
         if (m := Material(base_color_texture=picture))
     ]
@@ -115,5 +132,7 @@ def test_the_terminal_has_80_columns_and_long_lists_are_counted(tmp_path: Path) 
     assert max(map(len, told)) <= COLUMNS
     done = run("inspect", "x.glb", "--json", cwd=tmp_path)
     record = json.loads(done.stdout)
-    assert record["triangles"] == len(meshes) * len(faces) and len(record["materials"]) == LISTED + 5
+    assert (
+        record["triangles"] == len(meshes) * len(faces) and len(record["materials"]) == LISTED + 5
+    )
     assert record["materials"][0]["maps"][0]["color_space"] == "srgb"

@@ -1,7 +1,8 @@
 """Runs that are killed, interrupted or out of disk: whatever has its final name is whole.
 
-Signals come at events of a run (a file that is about to get its name, a module that is loaded, a line of progress),
-never at a time: how far a run is after some seconds depends on the machine and on what else it does.
+Signals come at events of a run (a file that is about to get its name, a module that is loaded, a
+line of progress), never at a time: how far a run is after some seconds depends on the machine and
+on what else it does.
 """
 
 from __future__ import annotations
@@ -51,7 +52,8 @@ def watch(what, arguments):
 sys.addaudithook(watch)
 """
 
-# counts the calls of this package's functions, and sends itself a signal at one of them. The last count goes to a file
+# counts the calls of this package's functions, and sends itself a signal at one of them. The last
+# count goes to a file
 AT_CALL = """
 import atexit, os, sys
 from pathlib import Path
@@ -90,7 +92,9 @@ def run(folder: Path, *more: str) -> tuple[int, str]:
     return ended(start(folder, COMMAND, *JOB, *more))
 
 
-def run_to_event(folder: Path, event: str, name: str, how: signal.Signals, *more: str) -> tuple[int, str]:
+def run_to_event(
+    folder: Path, event: str, name: str, how: signal.Signals, *more: str
+) -> tuple[int, str]:
     return ended(start(folder, AT_EVENT + COMMAND, event, name, str(int(how)), *JOB, *more))
 
 
@@ -101,7 +105,10 @@ def run_to_call(folder: Path, number: int, how: signal.Signals, *more: str) -> t
 def check_whole(folder: Path) -> None:
     """Everything that does not carry a temporary name can be read."""
     for path in folder.rglob("*"):
-        if any(part.startswith(".") for part in path.relative_to(folder).parts) or path.suffix == ".tmp":
+        if (
+            any(part.startswith(".") for part in path.relative_to(folder).parts)
+            or path.suffix == ".tmp"
+        ):
             continue
         if path.suffix in (".glb", ".gltf"):
             assert load(path).triangle_count > 0
@@ -152,7 +159,9 @@ ENDED = "error: interrupted; what was written is complete"
 
 
 def test_runs_interrupted_before_the_fit_write_nothing(folder: Path) -> None:
-    code, error = run_to_event(folder, "import", "xatlas", signal.SIGINT, "--steps", "2", "--out", "low.glb")
+    code, error = run_to_event(
+        folder, "import", "xatlas", signal.SIGINT, "--steps", "2", "--out", "low.glb"
+    )
     assert (code, error.splitlines()[-1]) == (130, ENDED)
     assert "Traceback" not in error and "Exception ignored" not in error, error
     assert [p.name for p in folder.iterdir()] == ["in.glb"]
@@ -160,7 +169,9 @@ def test_runs_interrupted_before_the_fit_write_nothing(folder: Path) -> None:
 
 def test_interrupted_fits_write_the_best_state(folder: Path) -> None:
     # without the interrupt, the fit would go on for hours
-    process = start(folder, TALKATIVE + COMMAND, *JOB, "--steps", "10000000", "--out", "low.glb", "--no-report")
+    process = start(
+        folder, TALKATIVE + COMMAND, *JOB, "--steps", "10000000", "--out", "low.glb", "--no-report"
+    )
     assert process.stderr is not None
     for line in process.stderr:
         if "held-out" in line:
@@ -204,7 +215,9 @@ def calls(tmp_path_factory: pytest.TempPathFactory) -> int:
     """How many calls of our functions a whole run makes."""
     folder = tmp_path_factory.mktemp("calls")
     save(make_asset(12, 24, 32), folder / "in.glb")
-    code, error = run_to_call(folder, 0, signal.SIGINT, "--steps", "4", "--out", "low.glb", "--checkpoint", "state")
+    code, error = run_to_call(
+        folder, 0, signal.SIGINT, "--steps", "4", "--out", "low.glb", "--checkpoint", "state"
+    )
     assert code == 0, error
     return int((folder / "calls.txt").read_text())
 
@@ -226,7 +239,9 @@ def test_runs_killed_at_fifty_moments(folder: Path, calls: int, suffix: str) -> 
 def test_runs_interrupted_at_fifty_moments(folder: Path, calls: int) -> None:
     cut = 0
     for k, number in enumerate(np.random.default_rng(1).integers(1, calls, 50)):
-        code, error = run_to_call(folder, number, signal.SIGINT, "--steps", "4", "--out", f"low{k}.glb")
+        code, error = run_to_call(
+            folder, number, signal.SIGINT, "--steps", "4", "--out", f"low{k}.glb"
+        )
         assert "Traceback" not in error and "Exception ignored" not in error, error
         assert code in (0, 130), error
         if code == 0:
@@ -234,7 +249,9 @@ def test_runs_interrupted_at_fifty_moments(folder: Path, calls: int) -> None:
         else:  # before the fit, or in the instant after the result was renamed
             assert ENDED in error
         check_whole(folder)
-        cut += "interrupted" in error  # in the line of an error, or in the note of a fit that ended early
+        cut += (
+            "interrupted" in error
+        )  # in the line of an error, or in the note of a fit that ended early
     assert cut
 
 
@@ -266,7 +283,9 @@ def test_a_full_disk_is_an_error_and_leaves_nothing(ball: Asset, tmp_path: Path)
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     lines = done.stdout.splitlines()
-    assert lines == [f"{s} refused clean []" for s in (".glb", ".gltf", ".obj", ".usda", ".usdc", ".usdz")]
+    assert lines == [
+        f"{s} refused clean []" for s in (".glb", ".gltf", ".obj", ".usda", ".usdc", ".usdz")
+    ]
 
 
 def test_outputs_that_cannot_be_written_are_refused_before_any_work(tmp_path: Path) -> None:
@@ -275,7 +294,12 @@ def test_outputs_that_cannot_be_written_are_refused_before_any_work(tmp_path: Pa
     with pytest.raises(InputError, match="nothing can be written there"):
         Outputs.of("/proc/x.glb").check()
     (tmp_path / "file").write_bytes(b"")
-    for folder in ({"report": "file"}, {"checkpoint": "file"}, {"report": "file/x"}, {"textures": "file"}):
+    for folder in (
+        {"report": "file"},
+        {"checkpoint": "file"},
+        {"report": "file/x"},
+        {"textures": "file"},
+    ):
         with pytest.raises(InputError, match="not a folder"):
             Outputs.of(tmp_path / "x.glb", **{k: tmp_path / v for k, v in folder.items()}).check()
     assert [p.name for p in tmp_path.iterdir()] == ["file"]

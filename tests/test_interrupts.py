@@ -22,7 +22,9 @@ def interrupt(number: int = signal.SIGINT) -> None:
     os.kill(os.getpid(), number)
 
 
-def test_interrupts_count_from_where_there_is_something_to_lose(capfd: pytest.CaptureFixture[str]) -> None:
+def test_interrupts_count_from_where_there_is_something_to_lose(
+    capfd: pytest.CaptureFixture[str],
+) -> None:
     before = signal.getsignal(signal.SIGINT)
     with Interrupts() as interrupts:
         with pytest.raises(KeyboardInterrupt):
@@ -65,7 +67,8 @@ def test_handlers_of_others_stay() -> None:
 def test_the_result_survives_two_interrupts(
     ball: Asset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, count: int
 ) -> None:
-    """The first in a step, the others in the look that comes after it and while the result is written."""
+    """The first in a step, the others in the look that comes after it and while the result is
+    written."""
     moments = iter([1, 2, 3])
 
     def when(moment: int) -> None:

@@ -13,7 +13,13 @@ import pytest
 import appearance_opt
 from appearance_opt.asset import load, save
 from appearance_opt.asset.types import Asset
-from appearance_opt.config import BakeOptions, SimplifyOptions, bake_options, read_toml, simplify_options
+from appearance_opt.config import (
+    BakeOptions,
+    SimplifyOptions,
+    bake_options,
+    read_toml,
+    simplify_options,
+)
 from appearance_opt.errors import InputError
 from appearance_opt.jobs import start
 from scenes.analytic import two_materials
@@ -30,8 +36,11 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 
 @pytest.mark.parametrize("suffix", [".obj", ".gltf"])
-def test_files_that_the_input_refers_to_are_not_replaced(ball: Asset, suffix: str, tmp_path: Path) -> None:
-    """Saved under another name, so that its material file, buffer and pictures have the name of the result."""
+def test_files_that_the_input_refers_to_are_not_replaced(
+    ball: Asset, suffix: str, tmp_path: Path
+) -> None:
+    """Saved under another name, so that its material file, buffer and pictures have the name of the
+    result."""
     save(ball, tmp_path / f"chair{suffix}")
     source = tmp_path / f"heavy{suffix}"
     shutil.move(tmp_path / f"chair{suffix}", source)
@@ -47,7 +56,9 @@ def test_files_that_the_input_refers_to_are_not_replaced(ball: Asset, suffix: st
 def test_the_start_is_not_replaced(ball: Asset, tmp_path: Path) -> None:
     save(two_materials(100), tmp_path / "low.glb")
     with pytest.raises(InputError, match="is the input itself"):
-        appearance_opt.simplify(ball, tmp_path / "low.glb", quick(triangles=None, init=str(tmp_path / "low.glb")))
+        appearance_opt.simplify(
+            ball, tmp_path / "low.glb", quick(triangles=None, init=str(tmp_path / "low.glb"))
+        )
 
 
 def test_loose_maps_do_not_replace_those_of_low(ball: Asset, tmp_path: Path) -> None:
@@ -55,13 +66,20 @@ def test_loose_maps_do_not_replace_those_of_low(ball: Asset, tmp_path: Path) -> 
     picture = tmp_path / "low_0_painted_base_color.png"
     options = bake_options(closed_form=True, unwrap=True, texture_size=64)
     with pytest.raises(InputError, match=f"could replace '.*{picture.name}'"):
-        appearance_opt.bake(ball, tmp_path / "low.obj", tmp_path / "new" / "low.glb", options, textures=tmp_path)
+        appearance_opt.bake(
+            ball, tmp_path / "low.obj", tmp_path / "new" / "low.glb", options, textures=tmp_path
+        )
     with pytest.raises(InputError):
-        appearance_opt.bake(ball, tmp_path / "low.obj", tmp_path / "b.glb", options, textures=picture)
+        appearance_opt.bake(
+            ball, tmp_path / "low.obj", tmp_path / "b.glb", options, textures=picture
+        )
 
 
-def test_a_resumed_run_goes_on_from_the_same_start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """How often triangles are moved follows from the time that is left: a resumed run may have less of it."""
+def test_a_resumed_run_goes_on_from_the_same_start(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """How often triangles are moved follows from the time that is left: a resumed run may have less
+    of it."""
     heavy, rounds = two_materials(2000), iter([1, 0])
     monkeypatch.setattr(start, "affordable", lambda *_: next(rounds))
     monkeypatch.setattr(start, "WORTHWHILE", 0.0)
@@ -73,8 +91,11 @@ def test_a_resumed_run_goes_on_from_the_same_start(tmp_path: Path, monkeypatch: 
         np.testing.assert_array_equal(a.positions, b.positions)
 
 
-def test_a_state_of_another_start_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The same job, whose start came out otherwise, as it may where time is short: as many vertices, elsewhere."""
+def test_a_state_of_another_start_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The same job, whose start came out otherwise, as it may where time is short: as many
+    vertices, elsewhere."""
     heavy, rounds = two_materials(2000), iter([1, 0])
     monkeypatch.setattr(start, "affordable", lambda *_: next(rounds))
     monkeypatch.setattr(start, "WORTHWHILE", 10.0)
@@ -85,7 +106,9 @@ def test_a_state_of_another_start_is_refused(tmp_path: Path, monkeypatch: pytest
         appearance_opt.simplify(heavy, None, quick(), checkpoint=tmp_path / "a", resume=True)
 
 
-def test_reports_are_json_in_a_folder_that_keeps_its_permissions(ball: Asset, tmp_path: Path) -> None:
+def test_reports_are_json_in_a_folder_that_keeps_its_permissions(
+    ball: Asset, tmp_path: Path
+) -> None:
     folder = tmp_path / "report"
     folder.mkdir(mode=0o700)
     appearance_opt.simplify(ball, None, quick(), report=folder)
@@ -111,7 +134,10 @@ def test_reports_are_json_in_a_folder_that_keeps_its_permissions(ball: Asset, tm
         ("seed = -1", "--seed -1: must be 0 or more"),
         ("background = 'nan,0,0'", "--background nan,0,0"),
         ("laplacian = inf", "--laplacian inf: is not a number"),
-        ("displacement_rate = 0.1", "--displacement-rate 0.1: must be given together with --displacement"),
+        (
+            "displacement_rate = 0.1",
+            "--displacement-rate 0.1: must be given together with --displacement",
+        ),
     ],
 )
 def test_nonsense_in_a_job_file_is_refused(text: str, words: str, tmp_path: Path) -> None:
@@ -124,7 +150,13 @@ def test_nonsense_in_a_job_file_is_refused(text: str, words: str, tmp_path: Path
 
 @pytest.mark.parametrize(
     "values",
-    [{"hit": "outermost"}, {"bits": 16}, {"maps": "normal"}, {"maps": "normal,material,ao"}, {"green": "directx"}],
+    [
+        {"hit": "outermost"},
+        {"bits": 16},
+        {"maps": "normal"},
+        {"maps": "normal,material,ao"},
+        {"green": "directx"},
+    ],
 )
 def test_what_a_joint_bake_ignores_is_refused(values: dict) -> None:
     with pytest.raises(InputError):

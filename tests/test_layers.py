@@ -27,7 +27,15 @@ MIDDLE = slice(12, 20)
 
 def card(z: float, material: Material, colors: NDArray | None = None, size: float = 1.0) -> Mesh:
     normals = np.tile(np.float32([0, 0, 1]), (4, 1))
-    return Mesh(SQUARE * np.float32(size) + np.float32([0, 0, z]), FACES, normals, UVS, None, colors, material)
+    return Mesh(
+        SQUARE * np.float32(size) + np.float32([0, 0, z]),
+        FACES,
+        normals,
+        UVS,
+        None,
+        colors,
+        material,
+    )
 
 
 def front(side: float = 1.0) -> Views:
@@ -53,7 +61,9 @@ def test_layers_are_blended_in_order(alphas: tuple[float, ...], side: float) -> 
     got = image(cards[1], cards[2], cards[0], views=front(side))
     expected, light = np.zeros((32, 32, 4)), 1.0
     for mesh, alpha in list(zip(cards, alphas, strict=True))[:: int(side)]:
-        solid = image(replace(mesh, material=replace(mesh.material, alpha_mode="opaque")), views=front(side))
+        solid = image(
+            replace(mesh, material=replace(mesh.material, alpha_mode="opaque")), views=front(side)
+        )
         expected += light * alpha * solid
         light *= 1 - alpha
     # colours of several materials are kept in half precision
@@ -70,7 +80,14 @@ def half(alpha: int = 255) -> Texture:
 
 @pytest.mark.parametrize(
     ("alpha", "cutoff", "seen"),
-    [(255, 0.5, True), (51, 0.2, True), (50, 0.2, False), (255, 1.0, True), (254, 1.0, False), (0, 0.0, True)],
+    [
+        (255, 0.5, True),
+        (51, 0.2, True),
+        (50, 0.2, False),
+        (255, 1.0, True),
+        (254, 1.0, False),
+        (0, 0.0, True),
+    ],
 )
 def test_cut_outs_are_there_or_not(alpha: int, cutoff: float, seen: bool) -> None:
     """Where alpha is at least the cutoff; the comparison is exact."""
@@ -91,7 +108,9 @@ def test_alpha_of_vertices_and_textures_and_factors_multiply() -> None:
     colors = np.full((4, 4), 0.5, np.float32)
     smoke = Material("smoke", base_color_texture=half(204), opacity=0.5, alpha_mode="blend")
     got = image(card(0, smoke, colors))
-    np.testing.assert_allclose(got[8:24, 19:24, 3], 0.5 * 0.8 * 0.5, atol=1e-4)  # kept in half precision
+    np.testing.assert_allclose(
+        got[8:24, 19:24, 3], 0.5 * 0.8 * 0.5, atol=1e-4
+    )  # kept in half precision
     assert image(card(0, replace(smoke, alpha_mode="opaque"), colors))[8:24, 8:24, 3].min() == 1
 
 
@@ -99,7 +118,10 @@ def test_transmission_is_coverage() -> None:
     """1 - t (1 - F), F = 4 % at an index of 1.5."""
     share = Texture(np.full((4, 4, 3), (128, 0, 0), np.uint8))
     glass = Material("glass", transmission=0.5)
-    for material, t in ((glass, 0.5), (replace(glass, transmission_texture=share), 0.5 * 128 / 255)):
+    for material, t in (
+        (glass, 0.5),
+        (replace(glass, transmission_texture=share), 0.5 * 128 / 255),
+    ):
         np.testing.assert_allclose(image(card(0, material))[16, 16, 3], 1 - 0.96 * t, atol=5e-4)
 
 
@@ -117,7 +139,8 @@ def test_backs_are_seen_through_fronts(double_sided: bool) -> None:
 
 
 def test_backs_of_opaque_faces_are_not_seen_through_a_window() -> None:
-    """The front half of a closed ball is glass; the other half, single-sided, turns its back to the eye."""
+    """The front half of a closed ball is glass; the other half, single-sided, turns its back to the
+    eye."""
     whole = ball(Material("wall", double_sided=False))
     near = whole.positions[whole.faces].mean(axis=1)[:, 2] > 0
     glass = Material("glass", opacity=0.25, alpha_mode="blend", double_sided=False)
@@ -146,7 +169,9 @@ def test_points_are_drawn_as_averages_are() -> None:
     reference = MeshReference(Asset(tuple(stack((0.25, 0.5, 0.75)))))
     average, points = reference.pair(front(), 32, 4, 0.4)
     np.testing.assert_allclose(average, reference.render(front(), 32, 4), atol=1e-6)
-    np.testing.assert_allclose(points[0, MIDDLE, MIDDLE, 3], average[0, MIDDLE, MIDDLE, 3], atol=1e-5)
+    np.testing.assert_allclose(
+        points[0, MIDDLE, MIDDLE, 3], average[0, MIDDLE, MIDDLE, 3], atol=1e-5
+    )
 
 
 def test_nothing_is_not_like_nothing() -> None:
@@ -162,7 +187,9 @@ def test_nothing_is_not_like_nothing() -> None:
 
 
 def test_what_pictures_do_not_show_is_noted() -> None:
-    glass, pane = (Asset((card(0, Material("m", **how)),)) for how in ({"transmission": 0.5}, {"opacity": 0.5}))
+    glass, pane = (
+        Asset((card(0, Material("m", **how)),)) for how in ({"transmission": 0.5}, {"opacity": 0.5})
+    )
     told = compare(glass, pane, views=1, resolution=32).notes
     assert [n for n in told if n.startswith("transmission is drawn like blended alpha")]
     assert compare(pane, pane, views=1, resolution=32).notes == ()

@@ -74,12 +74,16 @@ def bound(folder: Path, bindings: str, above: str = "") -> list[tuple[int, ...]]
     }}"""
         for name, color in COLORS.items()
     )
-    (folder / "x.usda").write_text(STAGE.format(above=above, materials=materials, bindings=bindings))
+    (folder / "x.usda").write_text(
+        STAGE.format(above=above, materials=materials, bindings=bindings)
+    )
     return [tuple(int(x) for x in m.material.base_color) for m in load(folder / "x.usda").meshes]
 
 
 def binding(*names: str) -> str:
-    return "\n".join(f"rel material:binding{'' if n == 'all' else ':' + n} = </R/{n}>" for n in names)
+    return "\n".join(
+        f"rel material:binding{'' if n == 'all' else ':' + n} = </R/{n}>" for n in names
+    )
 
 
 @pytest.mark.parametrize(
@@ -112,7 +116,9 @@ def picture(path: Path, color: tuple[int, int, int], size: int = 4) -> None:
 def test_byte_order_marks_of_obj_and_mtl_files(tmp_path: Path, encoding: str) -> None:
     picture(tmp_path / "röt.png", (200, 30, 30))
     mark = "\ufeff" if encoding == "utf-16-be" else ""
-    obj = "mtllib b.mtl\nv 0 0 0\nv 1 0 0\nv 1 1 0\nvt 0 0\nvt 1 0\nvt 1 1\nusemtl m\nf 1/1 2/2 3/3\n"
+    obj = (
+        "mtllib b.mtl\nv 0 0 0\nv 1 0 0\nv 1 1 0\nvt 0 0\nvt 1 0\nvt 1 1\nusemtl m\nf 1/1 2/2 3/3\n"
+    )
     (tmp_path / "b.obj").write_bytes((mark + obj).encode(encoding))
     (tmp_path / "b.mtl").write_bytes((mark + "newmtl m\nmap_Kd röt.png\n").encode(encoding))
     asset = load(tmp_path / "b.obj")
@@ -185,7 +191,14 @@ def variants(folder: Path) -> Path:
         ],
         "materials": [{"pbrMetallicRoughness": {"baseColorFactor": c}} for c in colors],
         "accessors": [
-            {"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC3", "min": [0, 0, 0], "max": [1, 1, 0]}
+            {
+                "bufferView": 0,
+                "componentType": 5126,
+                "count": 3,
+                "type": "VEC3",
+                "min": [0, 0, 0],
+                "max": [1, 1, 0],
+            }
         ],
         "bufferViews": [{"buffer": 0, "byteLength": 36}],
         "buffers": [{"uri": "x.bin", "byteLength": 36}],

@@ -1,4 +1,5 @@
-"""MaterialX networks, in USD prims and in documents: what becomes of base colour, roughness, metalness and normals."""
+"""MaterialX networks, in USD prims and in documents: what becomes of base colour, roughness,
+metalness and normals."""
 
 from __future__ import annotations
 
@@ -43,7 +44,9 @@ def Xform "R"
 
 def shader(name: str, identifier: str, *inputs: str, output: str = "token outputs:out") -> str:
     lines = "\n".join(inputs)
-    return f'def Shader "{name}"\n{{\nuniform token info:id = "{identifier}"\n{lines}\n{output}\n}}\n'
+    return (
+        f'def Shader "{name}"\n{{\nuniform token info:id = "{identifier}"\n{lines}\n{output}\n}}\n'
+    )
 
 
 MTLX = "token outputs:mtlx:surface.connect = </R/M/S.outputs:out>"
@@ -58,7 +61,9 @@ def image(name: str, file: str, kind: str = "color3", *more: str, space: str = "
     meta = f' (colorSpace = "{space}")' if space else ""
     types = {"color3": "color3f", "float": "float", "vector3": "float3"}
     output = f"{types[kind]} outputs:out"
-    return shader(name, f"ND_image_{kind}", f"asset inputs:file = @{file}@{meta}", *more, output=output)
+    return shader(
+        name, f"ND_image_{kind}", f"asset inputs:file = @{file}@{meta}", *more, output=output
+    )
 
 
 def picture(path: Path, seed: int = 0, size: int = 8) -> np.ndarray:
@@ -70,14 +75,24 @@ def picture(path: Path, seed: int = 0, size: int = 8) -> np.ndarray:
 
 
 SURFACES = [
-    ("standard_surface", ("base", "base_color", "specular_roughness", "metalness"), (0.8, 0.2, 0.0)),
-    ("open_pbr_surface", ("base_weight", "base_color", "specular_roughness", "base_metalness"), (0.8, 0.3, 0.0)),
+    (
+        "standard_surface",
+        ("base", "base_color", "specular_roughness", "metalness"),
+        (0.8, 0.2, 0.0),
+    ),
+    (
+        "open_pbr_surface",
+        ("base_weight", "base_color", "specular_roughness", "base_metalness"),
+        (0.8, 0.3, 0.0),
+    ),
     ("gltf_pbr", ("", "base_color", "roughness", "metallic"), (1.0, 1.0, 1.0)),
 ]
 
 
 @pytest.mark.parametrize(("kind", "names", "defaults"), SURFACES)
-def test_constants_and_defaults_of_the_surfaces(tmp_path: Path, kind: str, names: tuple, defaults: tuple) -> None:
+def test_constants_and_defaults_of_the_surfaces(
+    tmp_path: Path, kind: str, names: tuple, defaults: tuple
+) -> None:
     weight, color, rough, metal = names
     plain = network(tmp_path, shader("S", f"ND_{kind}_surfaceshader")).meshes[0].material
     assert (plain.base_color, plain.roughness, plain.metalness) == (
@@ -85,7 +100,11 @@ def test_constants_and_defaults_of_the_surfaces(tmp_path: Path, kind: str, names
         pytest.approx(defaults[1]),
         defaults[2],
     )
-    given = [f"color3f inputs:{color} = (0.5, 0.25, 1)", f"float inputs:{rough} = 0.75", f"float inputs:{metal} = 0.5"]
+    given = [
+        f"color3f inputs:{color} = (0.5, 0.25, 1)",
+        f"float inputs:{rough} = 0.75",
+        f"float inputs:{metal} = 0.5",
+    ]
     if weight:
         given.append(f"float inputs:{weight} = 0.5")
     asset = network(tmp_path, shader("S", f"ND_{kind}_surfaceshader", *given))
@@ -97,7 +116,9 @@ def test_constants_and_defaults_of_the_surfaces(tmp_path: Path, kind: str, names
 
 
 def test_pictures_and_factors_of_a_usd_network(tmp_path: Path) -> None:
-    color, rough, normal = (picture(tmp_path / f"{n}.png", k) for k, n in enumerate(("c", "r", "n")))
+    color, rough, normal = (
+        picture(tmp_path / f"{n}.png", k) for k, n in enumerate(("c", "r", "n"))
+    )
     asset = network(
         tmp_path,
         shader(
@@ -142,7 +163,11 @@ def test_arithmetic_of_pictures_is_done_in_linear_values(tmp_path: Path) -> None
     first, second = picture(tmp_path / "a.png", 1), picture(tmp_path / "b.png", 2)
     asset = network(
         tmp_path,
-        shader("S", "ND_gltf_pbr_surfaceshader", "color3f inputs:base_color.connect = </R/M/mix.outputs:out>"),
+        shader(
+            "S",
+            "ND_gltf_pbr_surfaceshader",
+            "color3f inputs:base_color.connect = </R/M/mix.outputs:out>",
+        ),
         shader(
             "mix",
             "ND_mix_color3",
@@ -178,8 +203,14 @@ def test_transforms_of_texture_coordinates(tmp_path: Path, order: int) -> None:
     pixels = picture(tmp_path / "c.png", 3)
     asset = network(
         tmp_path,
-        shader("S", "ND_gltf_pbr_surfaceshader", "color3f inputs:base_color.connect = </R/M/color.outputs:out>"),
-        image("color", "c.png", "color3", "float2 inputs:texcoord.connect = </R/M/place.outputs:out>"),
+        shader(
+            "S",
+            "ND_gltf_pbr_surfaceshader",
+            "color3f inputs:base_color.connect = </R/M/color.outputs:out>",
+        ),
+        image(
+            "color", "c.png", "color3", "float2 inputs:texcoord.connect = </R/M/place.outputs:out>"
+        ),
         shader(
             "place",
             "ND_place2d_vector2",
@@ -191,12 +222,20 @@ def test_transforms_of_texture_coordinates(tmp_path: Path, order: int) -> None:
             f"int inputs:operationorder = {order}",
             output="float2 outputs:out",
         ),
-        shader("uv", "ND_geompropvalue_vector2", 'string inputs:geomprop = "second"', output="float2 outputs:out"),
+        shader(
+            "uv",
+            "ND_geompropvalue_vector2",
+            'string inputs:geomprop = "second"',
+            output="float2 outputs:out",
+        ),
     )
     mesh = asset.meshes[0]
     given = np.array([(0.5, 0.5), (1, 0.5), (1, 1), (0.5, 1)])
     want = place2d(given, (0.5, 0.25), (0.5, 2), 30, (0.1, -0.2), order == 1)
-    by_corner = {tuple(p[:2].tolist()): uv for p, uv in zip(mesh.positions, upward(np.asarray(mesh.uvs)), strict=True)}
+    by_corner = {
+        tuple(p[:2].tolist()): uv
+        for p, uv in zip(mesh.positions, upward(np.asarray(mesh.uvs)), strict=True)
+    }
     got = [by_corner[corner] for corner in ((0, 0), (1, 0), (1, 1), (0, 1))]
     np.testing.assert_allclose(got, want, atol=1e-5)
     assert mesh.material.base_color_texture is not None
@@ -204,11 +243,16 @@ def test_transforms_of_texture_coordinates(tmp_path: Path, order: int) -> None:
 
 
 def test_tiled_images_and_gltf_images(tmp_path: Path) -> None:
-    """uv * uvtiling - uvoffset; and KHR_texture_transform, which counts v downward and turns the other way round."""
+    """uv * uvtiling - uvoffset; and KHR_texture_transform, which counts v downward and turns the
+    other way round."""
     picture(tmp_path / "c.png", 3)
     asset = network(
         tmp_path,
-        shader("S", "ND_gltf_pbr_surfaceshader", "color3f inputs:base_color.connect = </R/M/color.outputs:out>"),
+        shader(
+            "S",
+            "ND_gltf_pbr_surfaceshader",
+            "color3f inputs:base_color.connect = </R/M/color.outputs:out>",
+        ),
         shader(
             "color",
             "ND_tiledimage_color3",
@@ -223,7 +267,11 @@ def test_tiled_images_and_gltf_images(tmp_path: Path) -> None:
     np.testing.assert_allclose(uvs.max(axis=0), (2.75, 1.5), atol=1e-6)
     asset = network(
         tmp_path,
-        shader("S", "ND_gltf_pbr_surfaceshader", "color3f inputs:base_color.connect = </R/M/color.outputs:outcolor>"),
+        shader(
+            "S",
+            "ND_gltf_pbr_surfaceshader",
+            "color3f inputs:base_color.connect = </R/M/color.outputs:outcolor>",
+        ),
         shader(
             "color",
             "ND_gltf_colorimage",
@@ -267,9 +315,23 @@ def test_what_is_not_understood_is_named_and_keeps_its_default(tmp_path: Path) -
 def test_networks_that_run_in_circles_end(tmp_path: Path) -> None:
     asset = network(
         tmp_path,
-        shader("S", "ND_gltf_pbr_surfaceshader", "color3f inputs:base_color.connect = </R/M/a.outputs:out>"),
-        shader("a", "ND_add_color3", "color3f inputs:in1.connect = </R/M/b.outputs:out>", output="color3f outputs:out"),
-        shader("b", "ND_add_color3", "color3f inputs:in1.connect = </R/M/a.outputs:out>", output="color3f outputs:out"),
+        shader(
+            "S",
+            "ND_gltf_pbr_surfaceshader",
+            "color3f inputs:base_color.connect = </R/M/a.outputs:out>",
+        ),
+        shader(
+            "a",
+            "ND_add_color3",
+            "color3f inputs:in1.connect = </R/M/b.outputs:out>",
+            output="color3f outputs:out",
+        ),
+        shader(
+            "b",
+            "ND_add_color3",
+            "color3f inputs:in1.connect = </R/M/a.outputs:out>",
+            output="color3f outputs:out",
+        ),
     )
     assert asset.meshes[0].material.base_color == (1, 1, 1)
     assert [n for n in asset.notes if "circles" in n]
@@ -346,10 +408,16 @@ DOCUMENT = """<?xml version="1.0"?>
 GRAPH = '<input name="base_color" type="color3" nodegraph="G" output="color" />'
 
 
-def document(folder: Path, inputs: str = "", space: str = "", more: str = "", color: str = GRAPH) -> Asset:
+def document(
+    folder: Path, inputs: str = "", space: str = "", more: str = "", color: str = GRAPH
+) -> Asset:
     """A quad that wears the material of a document, which usd-core cannot compose."""
-    (folder / "x.mtlx").write_text(DOCUMENT.format(inputs=inputs, space=space, more=more, color=color))
-    stage = STAGE.format(output="", shaders="").replace('def Material "M"', 'def "Look" (references = @x.mtlx@)')
+    (folder / "x.mtlx").write_text(
+        DOCUMENT.format(inputs=inputs, space=space, more=more, color=color)
+    )
+    stage = STAGE.format(output="", shaders="").replace(
+        'def Material "M"', 'def "Look" (references = @x.mtlx@)'
+    )
     (folder / "x.usda").write_text(stage)
     return load(folder / "x.usda")
 
@@ -383,7 +451,9 @@ def test_colours_of_a_document_are_in_its_colour_space(tmp_path: Path) -> None:
     assert material.base_color == pytest.approx(srgb_to_linear(np.array([0.5, 0.25, 1.0])).tolist())
 
 
-def test_nodes_that_a_document_defines_itself_and_documents_that_it_includes(tmp_path: Path) -> None:
+def test_nodes_that_a_document_defines_itself_and_documents_that_it_includes(
+    tmp_path: Path,
+) -> None:
     picture(tmp_path / "c.png")
     (tmp_path / "inner.mtlx").write_text("""<?xml version="1.0"?>
 <materialx version="1.38">

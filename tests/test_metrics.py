@@ -17,13 +17,17 @@ GREY = 1.055 * 0.18 ** (1 / 2.4) - 0.055
 
 
 def linear(shown: NDArray | float) -> NDArray:
-    """The radiance that an sRGB screen shows as this value in [0, 1] (IEC 61966-2-1, written out)."""
+    """The radiance that an sRGB screen shows as this value in [0, 1] (IEC 61966-2-1, written
+    out)."""
     shown = np.asarray(shown, np.float64)
     return np.where(shown <= 0.04045, shown / 12.92, ((shown + 0.055) / 1.055) ** 2.4)
 
 
-def image(shown: NDArray | float, coverage: NDArray | float = 1.0, size: int = 32) -> NDArray[np.float32]:
-    """(1, size, size, 4), premultiplied: ``shown`` is what a screen shows of the covered part of a pixel."""
+def image(
+    shown: NDArray | float, coverage: NDArray | float = 1.0, size: int = 32
+) -> NDArray[np.float32]:
+    """(1, size, size, 4), premultiplied: ``shown`` is what a screen shows of the covered part of a
+    pixel."""
     out = np.zeros((1, size, size, 4), np.float32)
     out[..., 3] = coverage
     out[..., :3] = linear(shown) * out[..., 3:]
@@ -31,7 +35,8 @@ def image(shown: NDArray | float, coverage: NDArray | float = 1.0, size: int = 3
 
 
 def disc(radius: float, x: float, size: int = 64, fine: int = 32) -> NDArray[np.float32]:
-    """Grey, its middle ``x`` pixels right of the image's; coverage by ``fine``^2 samples per pixel."""
+    """Grey, its middle ``x`` pixels right of the image's; coverage by ``fine``^2 samples per
+    pixel."""
     at = (np.arange(size * fine) + 0.5) / fine - size / 2
     inside = (at[None] - x) ** 2 + at[:, None] ** 2 < radius**2
     return image(0.5, inside.reshape(size, fine, size, fine).mean(axis=(1, 3)), size)
@@ -47,7 +52,8 @@ def test_psnr_of_a_constant_difference(difference: float, decibel: float) -> Non
 
 
 def test_psnr_covered_leaves_out_what_neither_covers() -> None:
-    """Quarters of the image: both cover it, the reference alone does, the candidate alone does, neither does."""
+    """Quarters of the image: both cover it, the reference alone does, the candidate alone does,
+    neither does."""
     column = np.arange(32) // 8
     reference = image(0.5, np.isin(column, (0, 1)))
     candidate = image(0.6, np.isin(column, (0, 2)))
@@ -59,13 +65,16 @@ def test_psnr_covered_leaves_out_what_neither_covers() -> None:
     candidate[..., column == 3, :3] = linear(0.7) - 0.18
     bright = compare_images(reference, candidate)
     assert bright.psnr_covered == m.psnr_covered
-    assert bright.psnr == pytest.approx(-10 * np.log10((sum(squares) + (0.7 - GREY) ** 2) / 4), abs=1e-3)
+    assert bright.psnr == pytest.approx(
+        -10 * np.log10((sum(squares) + (0.7 - GREY) ** 2) / 4), abs=1e-3
+    )
 
 
 @pytest.mark.parametrize("shift", [1.0, 0.25])
 def test_silhouettes_of_a_disc_that_is_shifted(shift: float) -> None:
-    """Each of the 2 r rows loses ``shift`` pixels on one side and wins as many on the other, 4 r ``shift`` in all. The
-    outline, counted in edges of pixels, is two for each row and each column, 8 r: half of the shift."""
+    """Each of the 2 r rows loses ``shift`` pixels on one side and wins as many on the other, 4 r
+    ``shift`` in all. The outline, counted in edges of pixels, is two for each row and each column,
+    8 r: half of the shift."""
     radius = 20.0
     m = compare_images(disc(radius, 0.0), disc(radius, shift))
     # measured 0.4998 and 0.1250: coverage is counted in samples
@@ -73,7 +82,8 @@ def test_silhouettes_of_a_disc_that_is_shifted(shift: float) -> None:
 
 
 def test_intersection_over_union_of_a_disc_that_is_shifted() -> None:
-    """By one pixel: pi r^2 - 2 r over pi r^2 + 2 r, where r is large enough for the count of pixels to be the area."""
+    """By one pixel: pi r^2 - 2 r over pi r^2 + 2 r, where r is large enough for the count of pixels
+    to be the area."""
     radius = 20.0
     m = compare_images(disc(radius, 0.0), disc(radius, 1.0))
     expected = (np.pi * radius - 2) / (np.pi * radius + 2)

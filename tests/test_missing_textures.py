@@ -1,4 +1,5 @@
-"""Textures that an asset names and that are not there: refused with the way out, or ignored with a note."""
+"""Textures that an asset names and that are not there: refused with the way out, or ignored with a
+note."""
 
 from __future__ import annotations
 
@@ -20,7 +21,13 @@ def painted(ball: Asset) -> Asset:
     """All three kinds of textures, and factors that are not one."""
     mesh = ball.meshes[0]
     normal = Texture(np.full((4, 4, 3), (128, 128, 255), np.uint8))
-    material = replace(mesh.material, base_color=COLOR, roughness=ROUGHNESS, metalness=METALNESS, normal_texture=normal)
+    material = replace(
+        mesh.material,
+        base_color=COLOR,
+        roughness=ROUGHNESS,
+        metalness=METALNESS,
+        normal_texture=normal,
+    )
     return replace(ball, meshes=(replace(mesh, material=material),))
 
 
@@ -35,15 +42,21 @@ def written(asset: Asset, folder: Path, suffix: str) -> tuple[Path, list[Path]]:
 
 
 @pytest.mark.parametrize("suffix", [".gltf", ".obj", ".usda"])
-def test_a_missing_texture_is_refused_with_the_way_out(tmp_path: Path, painted: Asset, suffix: str) -> None:
+def test_a_missing_texture_is_refused_with_the_way_out(
+    tmp_path: Path, painted: Asset, suffix: str
+) -> None:
     path, pictures = written(painted, tmp_path, suffix)
-    with pytest.raises(InputError, match=r"which does not exist.*--missing-textures ignore") as caught:
+    with pytest.raises(
+        InputError, match=r"which does not exist.*--missing-textures ignore"
+    ) as caught:
         load(path)
     assert any(p.name in str(caught.value) for p in pictures)
 
 
 @pytest.mark.parametrize("suffix", [".gltf", ".obj", ".usda"])
-def test_ignored_textures_leave_the_factors_and_one_note_each(tmp_path: Path, painted: Asset, suffix: str) -> None:
+def test_ignored_textures_leave_the_factors_and_one_note_each(
+    tmp_path: Path, painted: Asset, suffix: str
+) -> None:
     path, pictures = written(painted, tmp_path, suffix)
     asset = load(path, missing_textures="ignore")
     material = asset.meshes[0].material
@@ -52,7 +65,9 @@ def test_ignored_textures_leave_the_factors_and_one_note_each(tmp_path: Path, pa
     assert material.normal_texture is None
     if suffix != ".usda":  # there a texture replaces the constant, and its scale holds the factor
         np.testing.assert_allclose(material.base_color, COLOR, atol=1e-6)
-        np.testing.assert_allclose((material.roughness, material.metalness), (ROUGHNESS, METALNESS), atol=1e-6)
+        np.testing.assert_allclose(
+            (material.roughness, material.metalness), (ROUGHNESS, METALNESS), atol=1e-6
+        )
     assert len(pictures) >= 3
     for picture in pictures:
         assert sum(picture.name in note for note in asset.notes) == 1
@@ -140,7 +155,11 @@ def test_the_elephant_without_its_picture(assets_dir: Path) -> None:
 
 @pytest.mark.parametrize("command", ["inspect", "compare", "simplify", "bake"])
 def test_every_command_takes_the_option(
-    tmp_path: Path, painted: Asset, command: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+    tmp_path: Path,
+    painted: Asset,
+    command: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture,
 ) -> None:
     path, _ = written(painted, tmp_path, ".obj")
     quick = ["--texture-size", "32", "--out", str(tmp_path / "out.glb"), "--no-report"]

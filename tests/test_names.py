@@ -1,4 +1,5 @@
-"""What options offer is what the packages below them have: ``config`` imports none of them, to start fast."""
+"""What options offer is what the packages below them have: ``config`` imports none of them, to
+start fast."""
 
 from __future__ import annotations
 

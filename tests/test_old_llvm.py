@@ -1,5 +1,5 @@
-"""LLVM 15 and 16, which current long-term distributions ship, abort the process on instructions that propagate NaNs
-(``render/math.py``): no kernel of any job may have one."""
+"""LLVM 15 and 16, which current long-term distributions ship, abort the process on instructions
+that propagate NaNs (``render/math.py``): no kernel of any job may have one."""
 
 from __future__ import annotations
 
@@ -26,7 +26,10 @@ NAN_PROPAGATING = re.compile(r"llvm\.(?:minimum|maximum)\b")
 def simplified(asset: Asset, out: Path, **values: object) -> Asset:
     report = out / "report" if values.pop("report", False) else None
     return simplify(
-        asset, out / "x.glb", simplify_options(**{"triangles": 200, **QUICK, **values}), report=report
+        asset,
+        out / "x.glb",
+        simplify_options(**{"triangles": 200, **QUICK, **values}),
+        report=report,
     ).asset
 
 
@@ -38,7 +41,10 @@ def baked(asset: Asset, out: Path, **values: object) -> None:
 
 def veiled(asset: Asset) -> Asset:
     """All of it half transparent."""
-    meshes = (replace(m, material=replace(m.material, alpha_mode="blend", opacity=0.5)) for m in asset.meshes)
+    meshes = (
+        replace(m, material=replace(m.material, alpha_mode="blend", opacity=0.5))
+        for m in asset.meshes
+    )
     return replace(asset, meshes=tuple(meshes))
 
 
@@ -47,7 +53,10 @@ JOBS: dict[str, Callable[[Asset, Path], object]] = {
     "a sphere": lambda asset, out: simplified(asset, out, init="sphere", steps=8),
     "displaced": lambda asset, out: simplified(asset, out, displacement=True, subdivision=(1, 2)),
     "every map": lambda asset, out: baked(
-        asset, out, maps=("normal", "object-normal", "material", "displacement", "ao", "curvature"), ao_rays=4
+        asset,
+        out,
+        maps=("normal", "object-normal", "material", "displacement", "ao", "curvature"),
+        ao_rays=4,
     ),
     "a joint bake": lambda asset, out: baked(asset, out, joint=True, subdivision=(1,)),
     "compared": lambda asset, out: compare(asset, asset, views=1, resolution=64),
@@ -61,6 +70,8 @@ def test_no_kernel_propagates_nans(job: str, tmp_path: Path) -> None:
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.kernel_history_clear()
         JOBS[job](asset, tmp_path)
-        kernels = [k["ir"].getvalue() for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT]
+        kernels = [
+            k["ir"].getvalue() for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT
+        ]
     assert len(kernels) > 5
     assert not {call for kernel in kernels for call in NAN_PROPAGATING.findall(kernel)}

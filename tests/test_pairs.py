@@ -1,4 +1,5 @@
-"""Pair antialiasing: its gradient against its own image, its bias against finite differences, its price when unused."""
+"""Pair antialiasing: its gradient against its own image, its bias against finite differences, its
+price when unused."""
 
 from __future__ import annotations
 
@@ -45,13 +46,17 @@ def two_balls() -> LatentMesh:
     return LatentMesh(p, f, np.arange(len(p), dtype=np.int32), f, np.zeros((len(p), 2), np.float32))
 
 
-def drawn(model: Model, views: Views, grid: Grid, quality: Quality) -> tuple[RenderedBatch, Surface, mi.Float]:
+def drawn(
+    model: Model, views: Views, grid: Grid, quality: Quality
+) -> tuple[RenderedBatch, Surface, mi.Float]:
     """(batch, surface, positions that track gradients)."""
     positions = mi.Float(np.array(model.positions()))
     dr.enable_grad(positions)
     surface = model.surface(positions)
     maps = model.maps(model.fitted_layer())
-    batch = gradient.render(model.scene, surface, maps, model.topology.walkable, views.records(), grid, quality, 0)
+    batch = gradient.render(
+        model.scene, surface, maps, model.topology.walkable, views.records(), grid, quality, 0
+    )
     return batch, surface, positions
 
 
@@ -66,7 +71,12 @@ def pulled(
 
 
 def differences(
-    model: Model, start: np.ndarray, fields: np.ndarray, step: float, image: Callable[[], np.ndarray], by: np.ndarray
+    model: Model,
+    start: np.ndarray,
+    fields: np.ndarray,
+    step: float,
+    image: Callable[[], np.ndarray],
+    by: np.ndarray,
 ) -> np.ndarray:
     """Central differences of <by, image> along displacement fields (N, V, 3)."""
     out = []
@@ -82,8 +92,12 @@ def differences(
 
 
 @pytest.mark.parametrize(("samples", "balls"), [(1, 1), (4, 1), (1, 2), (4, 2)])
-def test_the_gradient_is_that_of_the_blended_image(samples: int, balls: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("appearance_opt.render.surface.EDGE_ON_COSINE", 1e-6)  # nothing is held back
+def test_the_gradient_is_that_of_the_blended_image(
+    samples: int, balls: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(
+        "appearance_opt.render.surface.EDGE_ON_COSINE", 1e-6
+    )  # nothing is held back
     quality = replace(PAIRS, samples=samples)
     mesh = sphere(80, (0.1, 0.05, 0.0), 0.6, 16) if balls == 1 else two_balls()
     model, grid, views = white(mesh), Grid(2, 48), SAMPLER.draw(1, 2)
@@ -104,8 +118,8 @@ def test_the_gradient_is_that_of_the_blended_image(samples: int, balls: int, mon
         met.append([np.array(a).tobytes() for a in seen])
         return np.array(batch.image).reshape(-1, 4)
 
-    # where an outline passes the middle of a pixel, the image jumps by the difference between neighbours: such
-    # differences are left out
+    # where an outline passes the middle of a pixel, the image jumps by the difference between
+    # neighbours: such differences are left out
     numeric = differences(model, start, fields, 2e-5, image, by)
     smooth = np.array([a == b for a, b in zip(met[::2], met[1::2], strict=True)])
     assert smooth.sum() >= 4
@@ -115,7 +129,9 @@ def test_the_gradient_is_that_of_the_blended_image(samples: int, balls: int, mon
 
 
 @pytest.mark.parametrize(("splits", "samples", "bias"), [(0, 1, 0.015), (2, 1, 0.03), (2, 4, 0.01)])
-def test_pairs_carry_the_derivative_of_the_covered_area(splits: int, samples: int, bias: float) -> None:
+def test_pairs_carry_the_derivative_of_the_covered_area(
+    splits: int, samples: int, bias: float
+) -> None:
     mesh = ball(splits)
     model, grid, views = white(mesh), Grid(4, 64), SAMPLER.draw(1, 4)
     by = np.zeros((grid.pixels, 4))
@@ -127,14 +143,19 @@ def test_pairs_carry_the_derivative_of_the_covered_area(splits: int, samples: in
 
     def image() -> np.ndarray:
         here = model.surface(model.positions())
-        return np.array(deferred.render_image(model.scene, here, maps, records, grid, 64)).reshape(-1, 4)
+        return np.array(deferred.render_image(model.scene, here, maps, records, grid, 64)).reshape(
+            -1, 4
+        )
 
     numeric = differences(model, start, start[None], 0.02, image, by)[0]
-    # measured +0.3 %; -1.6 % with triangles as small as pixels; +0.04 % with 2 x 2 samples in a pixel
+    # measured +0.3 %; -1.6 % with triangles as small as pixels; +0.04 % with 2 x 2 samples in a
+    # pixel
     assert found == pytest.approx(numeric, rel=bias)
 
 
-def test_a_walk_finds_silhouettes_beyond_the_triangle_that_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_walk_finds_silhouettes_beyond_the_triangle_that_is_seen(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """Why we walk: without, fine meshes lose most of their outline."""
     model, grid, views = white(ball(0)), Grid(2, 64), SAMPLER.draw(1, 2)
     every, _, _ = drawn(model, views, grid, PAIRS)
@@ -145,7 +166,8 @@ def test_a_walk_finds_silhouettes_beyond_the_triangle_that_is_seen(monkeypatch: 
 
 
 def test_faces_around_faces() -> None:
-    """A strip of three triangles, and two more on the edge (2, 3), which then has no single neighbour."""
+    """A strip of three triangles, and two more on the edge (2, 3), which then has no single
+    neighbour."""
     faces = np.array([[0, 1, 2], [2, 1, 3], [2, 3, 4], [3, 2, 5]])
     edges = walkable(edge_list(faces), faces)
     packets = np.array(edges.packets).reshape(-1, 4)
@@ -187,7 +209,11 @@ def test_surfaces_that_run_into_each_other_move_their_meeting_curve() -> None:
     ours = Ours(problem, target, "log-srgb-l1")
     error = {}
     edges = Quality(8.0, 16, 4)
-    qualities = {"pairs": replace(PAIRS, samples=4), "edges": edges, "both": replace(edges, intersections=True)}
+    qualities = {
+        "pairs": replace(PAIRS, samples=4),
+        "edges": edges,
+        "both": replace(edges, intersections=True),
+    }
     for name, quality in qualities.items():
         g = ours(quality, 0)
         error[name] = error_of(np.einsum("vc,nvc->n", g, fields)[None], truth).relative
@@ -198,7 +224,9 @@ def test_surfaces_that_run_into_each_other_move_their_meeting_curve() -> None:
 
 def test_pairs_that_see_nothing_are_no_pairs() -> None:
     mesh = sphere(100, (0.0, 0.0, 0.0), 0.5, 16)
-    away = LatentMesh(mesh.positions + np.float32(100), mesh.faces, mesh.frame_vertex, mesh.frame_faces, mesh.uvs)
+    away = LatentMesh(
+        mesh.positions + np.float32(100), mesh.faces, mesh.frame_vertex, mesh.frame_faces, mesh.uvs
+    )
     model, grid = white(away), Grid(2, 32)
     batch, _, _ = drawn(model, SAMPLER.draw(0, 2), grid, PAIRS)
     assert batch.edges is None and batch.averaged is None

@@ -1,5 +1,5 @@
-"""Channels that are constant are written as factors: one test a channel, and mixed; what pictures say decides on
-noise."""
+"""Channels that are constant are written as factors: one test a channel, and mixed; what pictures
+say decides on noise."""
 
 from __future__ import annotations
 
@@ -83,7 +83,9 @@ def test_one_of_both_is_a_constant_channel_of_their_map(name: str, channel: int)
     assert (m.roughness, m.metalness) == (1, 1)
     np.testing.assert_array_equal(m.orm_texture.pixels[..., channel], round(0.6 * 255))
     other = {1: "metalness", 2: "roughness"}[channel]
-    np.testing.assert_allclose(m.orm_texture.linear()[..., 3 - channel], maps[other], atol=0.51 * STEP)
+    np.testing.assert_allclose(
+        m.orm_texture.linear()[..., 3 - channel], maps[other], atol=0.51 * STEP
+    )
 
 
 def test_a_flat_normal_map_is_none() -> None:
@@ -107,7 +109,9 @@ def test_a_constant_emission_is_a_factor() -> None:
 
 
 def test_everything_constant_leaves_no_map() -> None:
-    maps = dict(zip((*COLORS, "roughness", "metalness"), flat(0.5, 0.5, 0.5, 0.7, 0.0), strict=True))
+    maps = dict(
+        zip((*COLORS, "roughness", "metalness"), flat(0.5, 0.5, 0.5, 0.7, 0.0), strict=True)
+    )
     m = written(maps)
     assert (m.base_color_texture, m.orm_texture, m.normal_texture) == (None, None, None)
 
@@ -127,7 +131,9 @@ def test_texels_of_no_triangle_do_not_count() -> None:
     rough, known = flat(0.6)[0], EVERYWHERE.copy()
     rough[0, 0], known[0, 0] = 0.0, False
     assert np.ndim(replace_constant({"roughness": rough}, EVERYWHERE)["roughness"]) == 2
-    assert replace_constant({"roughness": rough}, known)["roughness"] == pytest.approx(0.6, abs=1e-5)
+    assert replace_constant({"roughness": rough}, known)["roughness"] == pytest.approx(
+        0.6, abs=1e-5
+    )
 
 
 @dataclass
@@ -158,10 +164,14 @@ class Told:
         (20, 0.0, 0.0, 0.6, False),  # no noise varies so much: not asked
     ],
 )
-def test_pictures_decide_on_noise(spread: float, changes: float, loses: float, start: object, constant: bool) -> None:
+def test_pictures_decide_on_noise(
+    spread: float, changes: float, loses: float, start: object, constant: bool
+) -> None:
     rough = 0.6 + ramp(-spread * STEP, spread * STEP)
     judge = Told(changes, loses)
-    out = replace_constant({"roughness": rough}, EVERYWHERE, judge, None if start is None else {"roughness": start})
+    out = replace_constant(
+        {"roughness": rough}, EVERYWHERE, judge, None if start is None else {"roughness": start}
+    )
     assert (not np.ndim(out["roughness"])) is constant
     assert len(judge.asked) == (spread * STEP < NOISE)
     other = Told(0.0, 0.0, channels=("red",))  # draws no other roughness
@@ -178,7 +188,11 @@ class OnlyRoughness(Told):
 
 def test_all_together_first_then_one_by_one() -> None:
     noise = ramp(-6 * STEP, 6 * STEP)
-    maps = {**dict.fromkeys(COLORS, srgb_to_linear(0.5 + noise)), "roughness": 0.6 + noise, "metalness": 0.3 + noise}
+    maps = {
+        **dict.fromkeys(COLORS, srgb_to_linear(0.5 + noise)),
+        "roughness": 0.6 + noise,
+        "metalness": 0.3 + noise,
+    }
     everything = Told(0.0, 0.0, channels=tuple(maps))
     assert not any(np.ndim(v) for v in replace_constant(maps, EVERYWHERE, everything).values())
     assert len(everything.asked) == 1
@@ -196,21 +210,29 @@ def grey_ball() -> Asset:
 
 
 def test_a_fit_of_a_grey_thing_writes_no_colour_maps(tmp_path: Path) -> None:
-    options = appearance_opt.simplify_options(triangles=200, steps=8, texture_size=64, resolution=48, views=2, pool=2)
+    options = appearance_opt.simplify_options(
+        triangles=200, steps=8, texture_size=64, resolution=48, views=2, pool=2
+    )
     result = appearance_opt.simplify(grey_ball(), tmp_path / "x.glb", options)
     m = result.asset.meshes[0].material
     assert m.base_color_texture is None and m.orm_texture is None and m.normal_texture is not None
-    np.testing.assert_allclose([*m.base_color, m.roughness, m.metalness], [0.5, 0.5, 0.5, 0.6, 0], atol=0.03)
+    np.testing.assert_allclose(
+        [*m.base_color, m.roughness, m.metalness], [0.5, 0.5, 0.5, 0.6, 0], atol=0.03
+    )
     noise = np.random.default_rng(0).integers(186, 191, (64, 64, 3)).astype(np.uint8)
     map_of_it = replace(m.normal_texture, pixels=noise, color_space="srgb")
     save(
-        Asset((replace(result.asset.meshes[0], material=replace(m, base_color_texture=map_of_it)),)), tmp_path / "y.glb"
+        Asset(
+            (replace(result.asset.meshes[0], material=replace(m, base_color_texture=map_of_it)),)
+        ),
+        tmp_path / "y.glb",
     )
     assert (tmp_path / "x.glb").stat().st_size < (tmp_path / "y.glb").stat().st_size - 3000
 
 
 def test_pictures_measure_what_changes() -> None:
-    """A step more of roughness changes little, black instead of grey a lot, and is a loss; the truth is a gain."""
+    """A step more of roughness changes little, black instead of grey a lot, and is a loss; the
+    truth is a gain."""
     asset = grey_ball()
     reference = MeshReference(asset)
     mesh = asset.meshes[0]

@@ -1,4 +1,5 @@
-"""PLY files: polygons, colours of vertices and faces under their names, textures and their coordinates."""
+"""PLY files: polygons, colours of vertices and faces under their names, textures and their
+coordinates."""
 
 from __future__ import annotations
 
@@ -26,7 +27,8 @@ def ply(
     face: tuple[str, ...] = (),
     comments: tuple[str, ...] = (),
 ) -> Path:
-    """A file. ``vertex``, ``face``: "type name", or "list type name", of what follows positions and vertex indices."""
+    """A file. ``vertex``, ``face``: "type name", or "list type name", of what follows positions and
+    vertex indices."""
     properties = [("float x", "float y", "float z", *vertex), ("list int vertex_indices", *face)]
     lines = ["ply", f"format {form} 1.0", *(f"comment {c}" for c in comments)]
     for name, rows, given in zip(("vertex", "face"), (vertices, faces), properties, strict=True):
@@ -38,7 +40,11 @@ def ply(
             words = []
             for value, kind in zip(row, given, strict=True):
                 code = CODES[kind.split()[-2]]
-                words += [("B", len(value)), *((code, v) for v in value)] if "list" in kind else [(code, value)]
+                words += (
+                    [("B", len(value)), *((code, v) for v in value)]
+                    if "list" in kind
+                    else [(code, value)]
+                )
             if form == "ascii":
                 body += (" ".join(f"{v:g}" for _, v in words) + "\n").encode()
             else:
@@ -69,7 +75,9 @@ def test_polygons_of_any_size_in_one_file(tmp_path: Path, form: str) -> None:
 
 
 @pytest.mark.parametrize("form", FORMATS)
-@pytest.mark.parametrize("names", ["red green blue", "diffuse_red diffuse_green diffuse_blue", "r g b"])
+@pytest.mark.parametrize(
+    "names", ["red green blue", "diffuse_red diffuse_green diffuse_blue", "r g b"]
+)
 @pytest.mark.parametrize(("kind", "scale"), [("uchar", 255), ("float", 1), ("ushort", 65535)])
 def test_colours_of_vertices_by_any_of_their_names(
     tmp_path: Path, form: str, names: str, kind: str, scale: int
@@ -77,7 +85,9 @@ def test_colours_of_vertices_by_any_of_their_names(
     shades = [0.0, 0.2, 0.6, 1.0]
     stored = [s if kind == "float" else round(s * scale) for s in shades]
     rows = [(*p, s, s, 0) for p, s in zip(SQUARE, stored, strict=True)]
-    asset = load(ply(tmp_path, form, rows, [[[0, 1, 2, 3]]], tuple(f"{kind} {n}" for n in names.split())))
+    asset = load(
+        ply(tmp_path, form, rows, [[[0, 1, 2, 3]]], tuple(f"{kind} {n}" for n in names.split()))
+    )
     got = by_corner(asset, "colors")
     for p, s in zip(SQUARE, shades, strict=True):
         linear = float(srgb_to_linear(np.array([s]))[0])
@@ -87,7 +97,9 @@ def test_colours_of_vertices_by_any_of_their_names(
 def test_colours_of_faces_split_their_vertices(tmp_path: Path) -> None:
     faces = [[[0, 1, 2], 255, 0, 0], [[0, 2, 3], 0, 0, 255]]
     colors = ("uchar red", "uchar green", "uchar blue")
-    got = by_corner(load(ply(tmp_path, "binary_little_endian", SQUARE, faces, face=colors)), "colors")
+    got = by_corner(
+        load(ply(tmp_path, "binary_little_endian", SQUARE, faces, face=colors)), "colors"
+    )
     assert got[(1, 0, 0)] == [(1, 0, 0)]
     assert got[(0, 1, 0)] == [(0, 0, 1)]
     assert sorted(got[(0, 0, 0)]) == [(0, 0, 1), (1, 0, 0)]
@@ -102,7 +114,11 @@ def test_a_texture_with_coordinates_of_the_vertices(tmp_path: Path, names: str) 
     picture(tmp_path / "my picture.png", (10, 20, 30))
     rows = [(*p, p[0] / 2, p[1] / 4) for p in SQUARE]
     uvs = tuple(f"float {n}" for n in names.split())
-    asset = load(ply(tmp_path, "ascii", rows, [[[0, 1, 2, 3]]], uvs, comments=("TextureFile my picture.png",)))
+    asset = load(
+        ply(
+            tmp_path, "ascii", rows, [[[0, 1, 2, 3]]], uvs, comments=("TextureFile my picture.png",)
+        )
+    )
     texture = asset.meshes[0].material.base_color_texture
     assert texture is not None
     assert (tuple(texture.pixels[0, 0]), texture.color_space) == ((10, 20, 30), "srgb")
@@ -115,8 +131,20 @@ def test_textures_with_coordinates_of_the_faces_corners(tmp_path: Path, form: st
         picture(tmp_path / f"{name}.png", color)
     faces = [[[0, 1, 2], [0, 0, 0.5, 0, 0.5, 1], 0], [[0, 2, 3], [0, 0, 0.25, 1, 0, 1], 1]]
     lists = ("list float texcoord", "int texnumber")
-    asset = load(ply(tmp_path, form, SQUARE, faces, face=lists, comments=("TextureFile a.png", "TextureFile b.png")))
-    assert [tuple(m.material.base_color_texture.pixels[0, 0]) for m in asset.meshes] == [(1, 2, 3), (4, 5, 6)]
+    asset = load(
+        ply(
+            tmp_path,
+            form,
+            SQUARE,
+            faces,
+            face=lists,
+            comments=("TextureFile a.png", "TextureFile b.png"),
+        )
+    )
+    assert [tuple(m.material.base_color_texture.pixels[0, 0]) for m in asset.meshes] == [
+        (1, 2, 3),
+        (4, 5, 6),
+    ]
     assert sorted(by_corner(asset, "uvs")[(1, 1, 0)]) == [(0.25, 0), (0.5, 0)]
 
 
@@ -124,14 +152,23 @@ def test_a_texture_takes_the_place_of_colours(tmp_path: Path) -> None:
     picture(tmp_path / "a.png", (1, 2, 3))
     rows = [(*p, p[0], p[1], 9, 9, 9) for p in SQUARE]
     given = ("float s", "float t", "uchar red", "uchar green", "uchar blue")
-    asset = load(ply(tmp_path, "ascii", rows, [[[0, 1, 2, 3]]], given, comments=("TextureFile a.png",)))
+    asset = load(
+        ply(tmp_path, "ascii", rows, [[[0, 1, 2, 3]]], given, comments=("TextureFile a.png",))
+    )
     assert asset.meshes[0].colors is None
     assert "its colours are not drawn where it has a texture" in asset.notes
 
 
 def test_missing_and_useless_textures(tmp_path: Path) -> None:
     rows = [(*p, p[0], p[1]) for p in SQUARE]
-    path = ply(tmp_path, "ascii", rows, [[[0, 1, 2]]], ("float s", "float t"), comments=("TextureFile a.png",))
+    path = ply(
+        tmp_path,
+        "ascii",
+        rows,
+        [[[0, 1, 2]]],
+        ("float s", "float t"),
+        comments=("TextureFile a.png",),
+    )
     with pytest.raises(InputError, match=r"a\.png.*--missing-textures ignore"):
         load(path)
     assert load(path, missing_textures="ignore").meshes[0].material.base_color_texture is None
@@ -141,7 +178,9 @@ def test_missing_and_useless_textures(tmp_path: Path) -> None:
 
 def test_normals_of_vertices_are_read(tmp_path: Path) -> None:
     rows = [(*p, 0, 0.6, -0.8) for p in SQUARE]
-    asset = load(ply(tmp_path, "ascii", rows, [[[0, 1, 2, 3]]], ("float nx", "float ny", "float nz")))
+    asset = load(
+        ply(tmp_path, "ascii", rows, [[[0, 1, 2, 3]]], ("float nx", "float ny", "float nz"))
+    )
     assert by_corner(asset, "normals")[(0, 0, 0)] == [(0, 0.6, -0.8)]
 
 

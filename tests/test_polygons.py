@@ -36,9 +36,17 @@ def test_convex_polygons_become_fans() -> None:
 
 
 @settings(max_examples=60)
-@given(corners=st.integers(4, 12), seed=st.integers(0, 2**16), first=st.integers(0, 11), backward=st.booleans())
-def test_star_shaped_polygons_are_covered_once(corners: int, seed: int, first: int, backward: bool) -> None:
-    """Around a point that sees all of them, radii that differ by a factor of ten: mostly not convex."""
+@given(
+    corners=st.integers(4, 12),
+    seed=st.integers(0, 2**16),
+    first=st.integers(0, 11),
+    backward=st.booleans(),
+)
+def test_star_shaped_polygons_are_covered_once(
+    corners: int, seed: int, first: int, backward: bool
+) -> None:
+    """Around a point that sees all of them, radii that differ by a factor of ten: mostly not
+    convex."""
     random = np.random.default_rng(seed)
     angle = (np.arange(corners) + random.uniform(0, 0.8, corners)) * (2 * np.pi / corners)
     radius = random.uniform(0.1, 1, corners)
@@ -54,7 +62,9 @@ def test_star_shaped_polygons_are_covered_once(corners: int, seed: int, first: i
     # all turn the way of the polygon, so that areas which add up to its own cannot overlap
     assert (areas @ whole > -1e-12).all()
     np.testing.assert_allclose(areas.sum(axis=0), whole, atol=1e-12)
-    np.testing.assert_allclose(np.linalg.norm(areas, axis=1).sum(), np.linalg.norm(whole), rtol=1e-9)
+    np.testing.assert_allclose(
+        np.linalg.norm(areas, axis=1).sum(), np.linalg.norm(whole), rtol=1e-9
+    )
 
 
 def test_faces_keep_their_order_where_only_some_are_cut() -> None:

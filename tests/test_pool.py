@@ -15,7 +15,8 @@ CAPACITY, BATCH = 12, 3
 
 
 class Counting:
-    """A black box that remembers how many views it was asked for; each image tells its view's light."""
+    """A black box that remembers how many views it was asked for; each image tells its view's
+    light."""
 
     def __init__(self) -> None:
         self.rendered = 0
@@ -23,7 +24,9 @@ class Counting:
     def render(self, views: Views, resolution: int, samples: int = 16) -> np.ndarray:
         self.rendered += len(views)
         image = np.zeros((len(views), resolution, resolution, 4), np.float32)
-        image[..., 0] = np.abs(np.array(views.records()).reshape(len(views), -1)[:, 3])[:, None, None]
+        image[..., 0] = np.abs(np.array(views.records()).reshape(len(views), -1)[:, 3])[
+            :, None, None
+        ]
         return image
 
 
@@ -33,7 +36,10 @@ def pool_of(reuse: int) -> ReferencePool:
 
 def seen(pool: ReferencePool, iterations: range) -> list[tuple]:
     """The views of each iteration, as something that can be compared and counted."""
-    return [tuple(map(tuple, np.array(pool.draw(i)[0].records()).reshape(BATCH, -1))) for i in iterations]
+    return [
+        tuple(map(tuple, np.array(pool.draw(i)[0].records()).reshape(BATCH, -1)))
+        for i in iterations
+    ]
 
 
 @pytest.mark.parametrize("reuse", [1, 2, 4])

@@ -35,7 +35,14 @@ class Listener:
 
 def test_a_job_tells_every_stage_before_it_begins(ball: Asset, tmp_path: Path) -> None:
     save(ball, tmp_path / "ball.glb")
-    small = {"steps": 1, "resolution": 16, "texture_size": 16, "pool": 4, "views": 2, "reallocate": 0}
+    small = {
+        "steps": 1,
+        "resolution": 16,
+        "texture_size": 16,
+        "pool": 4,
+        "views": 2,
+        "reallocate": 0,
+    }
     heard = Listener()
     options = ao.simplify_options(triangles=100, **small)
     ao.simplify(tmp_path / "ball.glb", tmp_path / "out.glb", options, progress=heard)

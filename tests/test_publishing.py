@@ -20,7 +20,9 @@ ENVIRONMENT = {**os.environ, "PYTHONPATH": str(Path(__file__).resolve().parents[
 
 
 def contents(folder: Path) -> dict[str, str]:
-    return {str(p.relative_to(folder)): p.read_text() for p in sorted(folder.rglob("*")) if p.is_file()}
+    return {
+        str(p.relative_to(folder)): p.read_text() for p in sorted(folder.rglob("*")) if p.is_file()
+    }
 
 
 def write_version(folder: Path, version: str) -> None:
@@ -55,12 +57,17 @@ def test_nothing_appears_when_writing_fails(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="more: is a folder"):
         write_version(tmp_path, "new")
     assert contents(tmp_path) == OLD
-    with pytest.raises(OSError, match=f"No such file.*{tmp_path}/x'"), publishing(tmp_path / "root") as place:
+    with (
+        pytest.raises(OSError, match=f"No such file.*{tmp_path}/x'"),
+        publishing(tmp_path / "root") as place,
+    ):
         place.with_name("x").read_text()
 
 
 @pytest.mark.parametrize("failing", range(8))
-def test_all_is_undone_when_a_rename_fails(tmp_path: Path, failing: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_all_is_undone_when_a_rename_fails(
+    tmp_path: Path, failing: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     write_version(tmp_path, "old")
     count = iter(range(100))
     whole = Path.rename
@@ -84,7 +91,8 @@ DYING = "import sys, pathlib; from tests.test_publishing import *; die_at_every_
 
 
 def killed(calls: int, what: Callable[[], None]) -> bool:
-    """Does a child that does this, and is killed at the call after so many that change the disk, die of it?"""
+    """Does a child that does this, and is killed at the call after so many that change the disk,
+    die of it?"""
     child = os.fork()
     if child == 0:
         left = iter(range(calls))
@@ -113,7 +121,8 @@ def consistent(folder: Path) -> bool:
 
 
 def die_at_every_call(within: Path) -> None:
-    """What ``test_a_killed_process_mixes_nothing_and_is_undone`` runs in a process of one thread, which may fork."""
+    """What ``test_a_killed_process_mixes_nothing_and_is_undone`` runs in a process of one thread,
+    which may fork."""
     for calls in range(100):
         folder = within / str(calls)
         folder.mkdir()
@@ -146,7 +155,8 @@ def test_what_a_living_process_is_writing_is_left_alone(tmp_path: Path) -> None:
 
 
 def planted(folder: Path, names: list[str]) -> Path:
-    """What looks like the remains of a killed run, as an archive of somebody else might bring along."""
+    """What looks like the remains of a killed run, as an archive of somebody else might bring
+    along."""
     root = folder / f"{PREFIX}planted"
     for name in ("new", "old"):
         (root / name).mkdir(parents=True)
@@ -186,8 +196,12 @@ def test_remains_that_others_planted_change_nothing(tmp_path: Path) -> None:
 def test_one_process_holds_a_name(tmp_path: Path) -> None:
     target = tmp_path / "new" / "out.glb"
     with locked(target):
-        assert lock_path(target).read_text().startswith(f"appearance-opt: process {os.getpid()} on ")
-        with pytest.raises(InputError, match=rf"out\.glb: another run is writing it \(process {os.getpid()} on "):
+        assert (
+            lock_path(target).read_text().startswith(f"appearance-opt: process {os.getpid()} on ")
+        )
+        with pytest.raises(
+            InputError, match=rf"out\.glb: another run is writing it \(process {os.getpid()} on "
+        ):
             locked(target).__enter__()
         with locked(tmp_path / "new" / "other.glb"):
             pass

@@ -17,7 +17,9 @@ from scenes.analytic import bumpy_sphere
 SAMPLER = ViewSampler((0.0, 0.0, 0.0), 1.0, seed=7)
 
 
-def drawn(p: NDArray, f: NDArray, views: Views, n: int, dx: float = 0.5, dy: float = 0.5) -> tuple[NDArray, NDArray]:
+def drawn(
+    p: NDArray, f: NDArray, views: Views, n: int, dx: float = 0.5, dy: float = 0.5
+) -> tuple[NDArray, NDArray]:
     """(triangle, depth) of all pixels, in the order of ``Grid``."""
     g = Grid(len(views), n)
     mesh = upload.packets(8, p), upload.index_packets(f), views.records()
@@ -28,7 +30,9 @@ def drawn(p: NDArray, f: NDArray, views: Views, n: int, dx: float = 0.5, dy: flo
     return np.array(samples.triangle), np.array(depth)
 
 
-def traced(p: NDArray, f: NDArray, views: Views, n: int, dx: float = 0.5, dy: float = 0.5) -> tuple[NDArray, NDArray]:
+def traced(
+    p: NDArray, f: NDArray, views: Views, n: int, dx: float = 0.5, dy: float = 0.5
+) -> tuple[NDArray, NDArray]:
     g = Grid(len(views), n)
     at = mi.Float(g.column) + dx, mi.Float(g.row) + dy
     samples, depth = rays.trace_depth(upload.scene_of(p, f), views.records(), g.view, *at, g.size)
@@ -43,16 +47,21 @@ def front(distance: float, fov: float = 40.0) -> Views:
 @pytest.mark.parametrize("triangles", [60, 1000, 40_000])
 @pytest.mark.parametrize("offset", [(0.5, 0.5), (0.125, 0.875)])
 @pytest.mark.parametrize("resolution", [1, 33, 128])
-def test_pixels_show_what_rays_hit(triangles: int, offset: tuple[float, float], resolution: int) -> None:
+def test_pixels_show_what_rays_hit(
+    triangles: int, offset: tuple[float, float], resolution: int
+) -> None:
     mesh = bumpy_sphere(triangles).meshes[0]
     case = mesh.positions, mesh.faces, SAMPLER.draw(0, 3), resolution, *offset
     (triangle, depth), (expected, distance) = drawn(*case), traced(*case)
     hit = expected != MISS
-    # pixels on an edge to within rounding may differ: measured none, and 2 of 100,000 of a finer mesh
+    # pixels on an edge to within rounding may differ: measured none, and 2 of 100,000 of a finer
+    # mesh
     assert (triangle == expected).mean() > 0.9998
     assert ((triangle != MISS) == hit).mean() > 0.9998
     same = hit & (triangle == expected)
-    np.testing.assert_allclose(depth[same], distance[same], rtol=1e-4)  # measured 5e-5, at one grazing triangle
+    np.testing.assert_allclose(
+        depth[same], distance[same], rtol=1e-4
+    )  # measured 5e-5, at one grazing triangle
     assert np.isinf(depth[triangle == MISS]).all()
 
 
@@ -65,13 +74,16 @@ def test_both_sides_of_a_triangle_are_seen() -> None:
 
 @pytest.mark.parametrize("eye", [(0.1, 0.2, 0.3), (0.0, 0.5, 0.05), (0.6, -0.3, -0.2)])
 def test_surfaces_that_pass_the_camera_need_no_clipping(eye: tuple) -> None:
-    """From within a cube of twelve triangles, most of which lie on both sides of the camera's plane."""
+    """From within a cube of twelve triangles, most of which lie on both sides of the camera's
+    plane."""
     corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], np.float32)
     quads = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
     faces = np.array([t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))])
     at = np.array([eye])
     views = look_at(at, np.array([0.9, 0.3, 0.1]), 100.0, at.astype(np.float32), 1.0)
-    (triangle, depth), (expected, distance) = (f(corners, faces, views, 64) for f in (drawn, traced))
+    (triangle, depth), (expected, distance) = (
+        f(corners, faces, views, 64) for f in (drawn, traced)
+    )
     assert (triangle != MISS).all()
     assert (triangle == expected).mean() > 0.999
     np.testing.assert_allclose(depth, distance, rtol=1e-4)
@@ -89,7 +101,9 @@ def test_no_pixel_falls_between_two_triangles() -> None:
     x, y = np.meshgrid(line, line, indexing="ij")
     p = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], 1).astype(np.float32)
     i = (np.arange(cells)[:, None] * (cells + 1) + np.arange(cells)).ravel()
-    f = np.concatenate([np.stack([i, i + 1, i + cells + 2], 1), np.stack([i, i + cells + 2, i + cells + 1], 1)])
+    f = np.concatenate(
+        [np.stack([i, i + 1, i + cells + 2], 1), np.stack([i, i + cells + 2, i + cells + 1], 1)]
+    )
     views = front(1.0, 90.0)  # two pixels per cell
     for offset in (0.0, 0.5):
         assert (drawn(p, f, views, n, offset, offset)[0] != MISS).all()

@@ -1,4 +1,5 @@
-"""A few bytes must not ask for any amount of memory or time: what an asset takes is counted before it is made."""
+"""A few bytes must not ask for any amount of memory or time: what an asset takes is counted before
+it is made."""
 
 from __future__ import annotations
 
@@ -39,7 +40,9 @@ def test_a_budget_is_one_for_all_kinds_and_says_what_would_exceed_it() -> None:
     assert budget.used == 600 * BYTES["vertices"] + 4 * 4 * 3 * 2  # what was refused is not taken
 
 
-def test_pictures_count_before_they_are_decoded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_pictures_count_before_they_are_decoded(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     data = images.encode_png(np.zeros((64, 64, 3), np.uint8))
     companions = Companions(budget=Budget(limit=3 * 64 * 64 * 3 * 2))
     for _ in range(3):
@@ -74,7 +77,9 @@ def test_instances_of_instances_are_counted_not_walked(tmp_path: Path) -> None:
     text = LAYER.replace('"R"\n{', '"R" (\n references = </L0>\n)\n{')
     for k in range(levels):
         child = f" (\n instanceable = true\n references = </L{k + 1}>\n)\n{{\n}}\n"
-        text += f'class "L{k}"\n{{\n' + "".join(f'def Xform "c{j}"{child}' for j in range(10)) + "}\n"
+        text += (
+            f'class "L{k}"\n{{\n' + "".join(f'def Xform "c{j}"{child}' for j in range(10)) + "}\n"
+        )
     text += f'class "L{levels}"\n{{\ndef Mesh "m"\n{{\n{MESH}}}\n}}\n'
     path = tmp_path / "x.usda"
     path.write_text(text)
@@ -91,14 +96,16 @@ def test_levels_of_refinement_have_a_bound_everywhere(tmp_path: Path, refine: in
 @pytest.mark.parametrize("size", ["nan", "inf", "-1"])
 def test_shapes_without_a_size_are_refused_by_name(tmp_path: Path, size: str) -> None:
     path = tmp_path / "x.usda"
-    path.write_text(LAYER.replace('"R"\n{', f'"R"\n{{\ndef Sphere "s"\n{{\ndouble radius = {size}\n}}\n'))
+    path.write_text(
+        LAYER.replace('"R"\n{', f'"R"\n{{\ndef Sphere "s"\n{{\ndouble radius = {size}\n}}\n')
+    )
     with pytest.raises(InputError, match=r"the radius of '/R/s' is"):
         load(path)
 
 
 def test_faces_that_are_no_polygons_take_no_more_time_than_others() -> None:
-    """Ears of a face that visits a few places over and over would take a time that grows with the cube of its
-    corners: hours here."""
+    """Ears of a face that visits a few places over and over would take a time that grows with the
+    cube of its corners: hours here."""
     corners = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0.2, 0.1, 0]])
     count = 100_000
     again = Polygons(np.array([count]), np.tile(np.arange(4), count // 4))
@@ -115,7 +122,9 @@ def test_upright_grids_are_resampled_as_other_places_are() -> None:
         texture = Texture(rng.integers(0, 255, (5, 7, 3)).astype(np.uint8), "srgb", wrap)
         u, v = rng.uniform(-2, 2, 11), rng.uniform(-2, 2, 13)
         y, x = np.meshgrid(v, u, indexing="ij")
-        wanted = resampling.bilinear(texture, np.stack([x.ravel(), y.ravel()], 1)).reshape(13, 11, 3)
+        wanted = resampling.bilinear(texture, np.stack([x.ravel(), y.ravel()], 1)).reshape(
+            13, 11, 3
+        )
         np.testing.assert_allclose(resampling.bilinear_grid(texture, u, v), wanted, atol=1e-9)
         middles = (np.arange(-7, 14) + 0.5) / 7
         copied = resampling.bilinear_grid(texture, middles, (np.arange(5) + 0.5) / 5)
@@ -123,7 +132,9 @@ def test_upright_grids_are_resampled_as_other_places_are() -> None:
         np.testing.assert_array_equal(copied[:, 7:14], texture.pixels)
 
 
-def test_resampled_textures_have_a_bound_together(ball: Asset, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_resampled_textures_have_a_bound_together(
+    ball: Asset, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Small pictures with different wrap modes, repeated often, would become large ones."""
     monkeypatch.setattr(uv_unification, "ASSET_TEXELS", 2 * 40 * 40)
     one = Texture(np.zeros((4, 4, 3), np.uint8), "srgb")
@@ -139,21 +150,31 @@ def test_resampled_textures_have_a_bound_together(ball: Asset, monkeypatch: pyte
     assert [("too large" in n) for n in notes] == [False, True, True]
 
 
-def test_a_material_file_named_again_is_read_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_material_file_named_again_is_read_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (tmp_path / "x.mtl").write_text("newmtl m\nKd 1 0 0\n")
-    (tmp_path / "x.obj").write_text("mtllib x.mtl\n" * 9 + "v 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl m\nf 1 2 3\n")
+    (tmp_path / "x.obj").write_text(
+        "mtllib x.mtl\n" * 9 + "v 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl m\nf 1 2 3\n"
+    )
     made: list[str] = []
     whole = mtl.MaterialReader._material
     monkeypatch.setattr(
-        mtl.MaterialReader, "_material", lambda self, name, *rest: made.append(name) or whole(self, name, *rest)
+        mtl.MaterialReader,
+        "_material",
+        lambda self, name, *rest: made.append(name) or whole(self, name, *rest),
     )
     assert load(tmp_path / "x.obj").meshes[0].material.base_color == (1.0, 0.0, 0.0)
     assert made == ["m"]
 
 
 def test_faces_too_thin_or_small_for_the_unwrapper_have_charts_of_their_own() -> None:
-    octahedron = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [-1, 0, 0], [0, -1, 0], [0, 0, -1]], np.float64)
-    sides = np.array([[0, 1, 2], [1, 3, 2], [3, 4, 2], [4, 0, 2], [1, 0, 5], [3, 1, 5], [4, 3, 5], [0, 4, 5]])
+    octahedron = np.array(
+        [[1, 0, 0], [0, 1, 0], [0, 0, 1], [-1, 0, 0], [0, -1, 0], [0, 0, -1]], np.float64
+    )
+    sides = np.array(
+        [[0, 1, 2], [1, 3, 2], [3, 4, 2], [4, 0, 2], [1, 0, 5], [3, 1, 5], [4, 3, 5], [0, 4, 5]]
+    )
     far = np.concatenate([octahedron, octahedron + [1e6, 0, 0]]), np.concatenate([sides, sides + 6])
     thin = np.array([[3, 0, 0], [4, 1e-8, 0], [5, 0, 0]])
     mixed = np.concatenate([octahedron, thin]), np.concatenate([sides, [[6, 7, 8], [8, 6, 7]]])

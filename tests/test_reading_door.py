@@ -1,4 +1,5 @@
-"""Whatever a damaged file makes a reader raise becomes one line; faults of our own do not; names are text."""
+"""Whatever a damaged file makes a reader raise becomes one line; faults of our own do not; names
+are text."""
 
 from __future__ import annotations
 
@@ -68,8 +69,12 @@ class _Raising:
         raise self.fault
 
 
-@pytest.mark.parametrize("fault", [NameError("pixls"), AssertionError(), NotImplementedError(), ImportError("x")])
-def test_planted_bugs_stay_visible(fault: Exception, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    "fault", [NameError("pixls"), AssertionError(), NotImplementedError(), ImportError("x")]
+)
+def test_planted_bugs_stay_visible(
+    fault: Exception, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def broken(*_: object) -> None:
         raise fault
 

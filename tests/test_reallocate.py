@@ -24,8 +24,12 @@ def test_weights_follow_the_error() -> None:
     faces = mesh.faces
     visible = np.ones(len(faces), bool)
     p = mesh.positions.astype(np.float64)
-    area = np.linalg.norm(np.cross(p[faces[:, 1]] - p[faces[:, 0]], p[faces[:, 2]] - p[faces[:, 0]]), axis=1)
-    np.testing.assert_allclose(weights(p, faces, area, visible), 1.0, atol=1e-6)  # error everywhere the same
+    area = np.linalg.norm(
+        np.cross(p[faces[:, 1]] - p[faces[:, 0]], p[faces[:, 2]] - p[faces[:, 0]]), axis=1
+    )
+    np.testing.assert_allclose(
+        weights(p, faces, area, visible), 1.0, atol=1e-6
+    )  # error everywhere the same
     np.testing.assert_array_equal(weights(p, faces, np.zeros(len(faces)), visible), 1.0)
     right = p[faces].mean(axis=1)[:, 0] > 0
     uneven = weights(p, faces, np.where(right, 8.0, 1.0) * area, visible)
@@ -49,7 +53,10 @@ def test_the_error_of_a_start_is_found_where_it_is(bumps: MeshReference) -> None
     moved = start.mesh.positions.copy()
     moved[moved[:, 0] > 0.3] *= 0.9
     dented, dented_by_face = judge.measure(
-        type(start.mesh)(moved, *(getattr(start.mesh, n) for n in ("faces", "frame_vertex", "frame_faces", "uvs"))),
+        type(start.mesh)(
+            moved,
+            *(getattr(start.mesh, n) for n in ("faces", "frame_vertex", "frame_faces", "uvs")),
+        ),
         start.maps,
     )
     assert dented > 2 * whole
@@ -70,7 +77,8 @@ def test_the_best_start_of_all_rounds_is_kept(bumps: MeshReference) -> None:
 
 
 def black_on(side: float) -> MeshReference:
-    """Bumps of the same heights all around, but the side of -x or +x is black: whatever its shape, little is seen."""
+    """Bumps of the same heights all around, but the side of -x or +x is black: whatever its shape,
+    little is seen."""
     asset = bumpy_sphere(5_000, 128)
     (mesh,) = asset.meshes
     texel = (np.arange(128) + 0.5) / 128 * 2 - 1
@@ -86,12 +94,17 @@ def black_on(side: float) -> MeshReference:
 
 
 def test_triangles_move_to_where_something_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("appearance_opt.jobs.start.WORTHWHILE", 2.0)  # the moved ones are taken, whatever they gain
+    monkeypatch.setattr(
+        "appearance_opt.jobs.start.WORTHWHILE", 2.0
+    )  # the moved ones are taken, whatever they gain
     monkeypatch.setattr("appearance_opt.initial.reallocate.RESOLUTION", 128)
     share = []
     for side in (-1.0, 1.0):
         start = make_start(
-            black_on(side), simplify_options(triangles=300, texture_size=128, reallocate=1), SAMPLER, 300
+            black_on(side),
+            simplify_options(triangles=300, texture_size=128, reallocate=1),
+            SAMPLER,
+            300,
         )
         share.append(float((start.mesh.positions[start.mesh.faces].mean(axis=1)[:, 0] > 0).mean()))
     # the same shape: what differs is where the black is. Measured 0.06 to 0.08 with other views
@@ -99,7 +112,8 @@ def test_triangles_move_to_where_something_is_seen(monkeypatch: pytest.MonkeyPat
 
 
 @pytest.mark.parametrize(
-    ("left", "taken", "rounds"), [(60.0, 5.0, 2), (60.0, 8.0, 1), (60.0, 15.0, 0), (-1.0, 5.0, 0), (None, 60.0, 2)]
+    ("left", "taken", "rounds"),
+    [(60.0, 5.0, 2), (60.0, 8.0, 1), (60.0, 15.0, 0), (-1.0, 5.0, 0), (None, 60.0, 2)],
 )
 def test_slow_decimations_are_not_repeated(left: float | None, taken: float, rounds: int) -> None:
     assert affordable(2, taken, left) == rounds

@@ -42,7 +42,10 @@ def obj(tmp_path: Path, faces: str | bytes, mtl: str | bytes = "", name: str = "
     [
         ('def NurbsPatch "a"\n{\n}\n', "NurbsPatch '/a': ignored"),
         (f'def Mesh "a"\n{{\n{MESH}    token visibility = "invisible"\n}}\n', "'/a': hidden"),
-        (f'def Mesh "a"\n{{\n{MESH}    uniform token purpose = "proxy"\n}}\n', "'/a': of purpose proxy"),
+        (
+            f'def Mesh "a"\n{{\n{MESH}    uniform token purpose = "proxy"\n}}\n',
+            "'/a': of purpose proxy",
+        ),
     ],
 )
 def test_an_error_keeps_the_notes_that_explain_it(tmp_path: Path, text: str, why: str) -> None:
@@ -81,7 +84,9 @@ def test_any_texture_that_is_of_no_use_can_be_ignored(tmp_path: Path, kind: str,
     elif form == "gltf":
         texture = {"baseColorTexture": {"index": 0}, "baseColorFactor": [0.5, 0.25, 1, 1]}
         given, binary = triangle_document(
-            images=[{"uri": name}], textures=[{"source": 0}], materials=[{"pbrMetallicRoughness": texture}]
+            images=[{"uri": name}],
+            textures=[{"source": 0}],
+            materials=[{"pbrMetallicRoughness": texture}],
         )
         given["meshes"][0]["primitives"][0]["material"] = 0
         path = tmp_path / "x.glb"
@@ -139,7 +144,9 @@ def test_comments_after_the_name_of_a_map(tmp_path: Path, name: str) -> None:
 def test_names_in_latin_1(tmp_path: Path, on_disk: bytes) -> None:
     """The file may have the bytes as its name, or, unpacked by another system, the letters."""
     try:
-        Path(os.fsdecode(os.fsencode(tmp_path) + b"/" + on_disk)).write_bytes(images.encode_png(PIXELS))
+        Path(os.fsdecode(os.fsencode(tmp_path) + b"/" + on_disk)).write_bytes(
+            images.encode_png(PIXELS)
+        )
     except OSError:
         pytest.skip("the file system takes no such name")
     mtl = "newmtl Blätt\nmap_Kd blätt.png\n".encode("latin-1")
@@ -159,7 +166,9 @@ def test_data_uris_without_padding_and_with_line_breaks(tmp_path: Path, change: 
         "lines": "\r\n".join(text[k : k + 20] for k in range(0, len(text), 20)),
         "escaped": text.replace("=", "%3D"),
     }[change]
-    given["buffers"] = [{"uri": f"data:application/octet-stream;base64,{text}", "byteLength": len(binary)}]
+    given["buffers"] = [
+        {"uri": f"data:application/octet-stream;base64,{text}", "byteLength": len(binary)}
+    ]
     (tmp_path / "x.gltf").write_text(json.dumps(given))
     assert load(tmp_path / "x.gltf").triangle_count == 1
 
@@ -169,7 +178,12 @@ def test_chunks_filled_up_with_zeros(tmp_path: Path) -> None:
     text = json.dumps(given).encode()
     text += b"\0" * (4 + -len(text) % 4)
     binary += b"\0" * (-len(binary) % 4)
-    chunks = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(binary), b"BIN\0") + binary
+    chunks = (
+        struct.pack("<I4s", len(text), b"JSON")
+        + text
+        + struct.pack("<I4s", len(binary), b"BIN\0")
+        + binary
+    )
     path = tmp_path / "x.glb"
     path.write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks)
     assert load(path).triangle_count == 1
@@ -179,7 +193,10 @@ def test_chunks_filled_up_with_zeros(tmp_path: Path) -> None:
 
 
 def test_assets_of_several_folders_say_which_root_to_allow(tmp_path: Path) -> None:
-    for folder, text in (("geo", f'def Mesh "g"\n{{\n{MESH}}}\n'), ("more", f'def Mesh "m"\n{{\n{MESH}}}\n')):
+    for folder, text in (
+        ("geo", f'def Mesh "g"\n{{\n{MESH}}}\n'),
+        ("more", f'def Mesh "m"\n{{\n{MESH}}}\n'),
+    ):
         (tmp_path / "show" / folder).mkdir(parents=True)
         (tmp_path / "show" / folder / "part.usda").write_text(STAGE + text)
     shots = tmp_path / "show" / "shots"

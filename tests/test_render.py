@@ -41,7 +41,13 @@ def test_texture_lookup_interpolates_and_wraps() -> None:
     texels = np.zeros((2, 4, 2), np.float32)
     texels[..., 0] = [[0, 1, 2, 3], [10, 11, 12, 13]]
     cases = {
-        REPEAT: [(0.5 / 4, 0.25, 0.0), (1 / 4, 0.25, 0.5), (0.0, 0.25, 1.5), (1.125, 0.25, 0.0), (0.125, 0.5, 5.0)],
+        REPEAT: [
+            (0.5 / 4, 0.25, 0.0),
+            (1 / 4, 0.25, 0.5),
+            (0.0, 0.25, 1.5),
+            (1.125, 0.25, 0.0),
+            (0.125, 0.5, 5.0),
+        ],
         CLAMP: [(0.0, 0.25, 0.0), (1.5, 0.25, 3.0), (0.125, -1.0, 0.0), (0.125, 2.0, 10.0)],
         MIRROR: [(-0.125, 0.25, 0.0), (1.125, 0.25, 3.0), (1.375, 0.25, 2.0)],
     }
@@ -61,7 +67,9 @@ def test_mip_levels_average_and_blend() -> None:
     # the coarsest level is approached, not reached: lod is capped a thousandth below it
     assert float(whole[0]) == pytest.approx(float(texels[..., 0].mean()), abs=2e-3)
     level1 = texels.reshape(4, 2, 4, 2, 2).mean(axis=(1, 3))
-    centre = pyramid.lookup(None, mi.Point2f(mi.Float([0.625]), mi.Float([0.375])), mi.Float([4 / 64]))[0]
+    centre = pyramid.lookup(
+        None, mi.Point2f(mi.Float([0.625]), mi.Float([0.375])), mi.Float([4 / 64])
+    )[0]
     assert float(centre[0]) == pytest.approx(float(level1[1, 2, 0]), abs=1e-5)
 
 
@@ -69,7 +77,9 @@ def test_textures_in_half_precision_are_off_by_its_rounding() -> None:
     rng = np.random.default_rng(3)
     texels = rng.random((32, 32, 8)).astype(np.float32)
     texels[0, 0] = 1e6
-    exact, rounded = (build_pyramid([Base.of(texels)], [CLAMP], kind=k) for k in (np.float32, np.float16))
+    exact, rounded = (
+        build_pyramid([Base.of(texels)], [CLAMP], kind=k) for k in (np.float32, np.float16)
+    )
     uv = mi.Point2f(*rng.random((2, 1000)).astype(np.float32))
     footprint = mi.Float((10 ** rng.uniform(-4, 0, 1000)).astype(np.float32))
     single, half = (np.array(mi.ArrayXf(p.lookup(None, uv, footprint))) for p in (exact, rounded))
@@ -98,8 +108,13 @@ def test_pyramids_are_made_in_bands_as_in_one(monkeypatch: pytest.MonkeyPatch) -
 
 
 def test_angles_are_those_of_the_arc_tangent() -> None:
-    true = np.concatenate([np.linspace(1e-6, np.pi, 10_001), np.pi * np.arange(1, 8) / 8, 10.0 ** np.arange(-7, 0)])
-    sine, cosine = (mi.Float(f(true).clip(1e-12 if f is np.sin else -1).astype(np.float32)) for f in (np.sin, np.cos))
+    true = np.concatenate(
+        [np.linspace(1e-6, np.pi, 10_001), np.pi * np.arange(1, 8) / 8, 10.0 ** np.arange(-7, 0)]
+    )
+    sine, cosine = (
+        mi.Float(f(true).clip(1e-12 if f is np.sin else -1).astype(np.float32))
+        for f in (np.sin, np.cos)
+    )
     dr.enable_grad(sine, cosine)
     angle = angle_of(sine, cosine)
     exact = np.arctan2(np.array(sine).astype(np.float64), np.array(cosine).astype(np.float64))
@@ -115,7 +130,9 @@ def test_a_fitted_pyramid_is_that_of_the_decoded_values() -> None:
     maps = {n: rng.random((16, 16)).astype(np.float32) for n in ("red", "normal_x", "roughness")}
     codec = TexelCodec(tuple(maps), 16)
     ours = codec.layer(codec.encode(maps)).pyramid
-    bounded = np.stack([maps["red"], maps["normal_x"], maps["roughness"].clip(0.08), 0 * maps["red"]], axis=-1)
+    bounded = np.stack(
+        [maps["red"], maps["normal_x"], maps["roughness"].clip(0.08), 0 * maps["red"]], axis=-1
+    )
     expected = build_pyramid([Base.of(bounded)], [CLAMP])
     assert ours.layout == expected.layout
     np.testing.assert_allclose(np.array(ours.texels), np.array(expected.texels), atol=1e-6)
@@ -123,19 +140,28 @@ def test_a_fitted_pyramid_is_that_of_the_decoded_values() -> None:
 
 def test_several_materials_share_one_buffer(ball: Asset) -> None:
     red = Material("red", (1.0, 0.0, 0.0), roughness=1.0)
-    other = replace(ball.meshes[0], positions=ball.meshes[0].positions + np.float32([3, 0, 0]), material=red)
+    other = replace(
+        ball.meshes[0], positions=ball.meshes[0].positions + np.float32([3, 0, 0]), material=red
+    )
     views = look_at(
-        np.array([[0.0, 0, 6], [3.0, 0, 6]]), np.array([[0.0, 0, 0], [3.0, 0, 0]]), 20.0, np.full((2, 3), 9.0), 700.0
+        np.array([[0.0, 0, 6], [3.0, 0, 6]]),
+        np.array([[0.0, 0, 0], [3.0, 0, 0]]),
+        20.0,
+        np.full((2, 3), 9.0),
+        700.0,
     )
     both = MeshReference(Asset((ball.meshes[0], other))).render(views, 64, 1)
     alone = MeshReference(ball).render(views[:1], 64, 1)
     middle = np.s_[20:44, 20:44]
     np.testing.assert_allclose(both[0][middle], alone[0][middle], atol=1e-5)
-    assert both[1][32, 32, 0] > 10 * both[1][32, 32, 1] > 0  # dielectric: red with a white highlight
+    assert (
+        both[1][32, 32, 0] > 10 * both[1][32, 32, 1] > 0
+    )  # dielectric: red with a white highlight
 
 
 def test_our_image_equals_mitsubas(ball: Asset) -> None:
-    """A textured ball, lit from the side, against Mitsuba's ``direct`` integrator with the same BRDF."""
+    """A textured ball, lit from the side, against Mitsuba's ``direct`` integrator with the same
+    BRDF."""
     mitsuba_peer.register()
     views = look_at(np.array([[0.0, 0, 6.0]]), np.zeros(3), 25.0, np.array([[2.0, 3.0, 5.0]]), 40.0)
     found = compare_asset(ball, views, 96)
@@ -181,7 +207,10 @@ def test_a_pair_is_the_image_at_outlines_and_points_elsewhere(ball: Asset) -> No
     reference = MeshReference(ball)
     views = ViewSampler((0.0, 0.0, 0.0), 1.0, seed=2).draw(0, 2)
     average, points = reference.pair(views, 192, 16, 0.4)
-    full, single = reference.render(views, 192, 16), reference.render_device(views.records(), Grid(2, 192), 1, 0.4)
+    full, single = (
+        reference.render(views, 192, 16),
+        reference.render_device(views.records(), Grid(2, 192), 1, 0.4),
+    )
     np.testing.assert_array_equal(points, np.array(single).reshape(points.shape))
     outline = (full[..., 3] > 0) & (full[..., 3] < 1)
     assert outline.sum() > 100
@@ -196,7 +225,8 @@ def test_a_pair_is_the_image_at_outlines_and_points_elsewhere(ball: Asset) -> No
     beside = within(1) & ~outline & (full[..., 3] == 1) & lit
     assert beside.sum() > 500
     assert not same[beside].any()
-    # a slanted surface is no outline, although depths five pixels apart differ by more than 2 % there
+    # a slanted surface is no outline, although depths five pixels apart differ by more than 2 %
+    # there
     assert same[~outline].mean() > 0.95 and not same[outline].any()
     assert same[~within(5)].all()
     assert within(5).mean() < 0.3
@@ -205,7 +235,9 @@ def test_a_pair_is_the_image_at_outlines_and_points_elsewhere(ball: Asset) -> No
 def test_a_moved_scene_shows_what_a_new_one_does() -> None:
     """The BVH of a moving mesh is another one than that of a mesh that stands still."""
     mesh, grid = sphere(400, (0.0, 0.0, 0.0), 0.9, 16), Grid(2, 64)
-    moved = (mesh.positions * np.float32([0.5, 1.0, 0.8]) + np.float32([0.2, 0.0, 0.0])).astype(np.float32)
+    moved = (mesh.positions * np.float32([0.5, 1.0, 0.8]) + np.float32([0.2, 0.0, 0.0])).astype(
+        np.float32
+    )
     moving = upload.MovingScene(mesh.positions, mesh.faces)
     records = ViewSampler((0.0, 0.0, 0.0), 1.0, seed=4).draw(0, 2).records()
 
@@ -216,7 +248,10 @@ def test_a_moved_scene_shows_what_a_new_one_does() -> None:
 
     for positions in (mesh.positions, moved):
         moving.move(mi.Float(positions.ravel()))
-        (triangle, depth), (expected, there) = seen(moving.scene), seen(upload.scene_of(positions, mesh.faces))
+        (triangle, depth), (expected, there) = (
+            seen(moving.scene),
+            seen(upload.scene_of(positions, mesh.faces)),
+        )
         assert (expected != rays.MISS).sum() > 500
         # on an edge between two triangles either may be met
         assert (triangle == expected).mean() > 0.999

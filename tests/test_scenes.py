@@ -1,4 +1,5 @@
-"""Procedural scenes: counts, closed surfaces, known areas and volumes, maps, and the same bytes twice."""
+"""Procedural scenes: counts, closed surfaces, known areas and volumes, maps, and the same bytes
+twice."""
 
 from __future__ import annotations
 
@@ -16,7 +17,10 @@ from scenes.noise import cellular_noise, fractal_noise, lattice_noise
 from scenes.relic import relic
 
 CLOSED = ("relic", "furnace", "torus", "two_materials", "bumpy_sphere")
-SMALL = {"relic": {"triangles": 40_000, "texture_size": 256}, "bumpy_sphere": {"triangles": 10_000, "texture_size": 64}}
+SMALL = {
+    "relic": {"triangles": 40_000, "texture_size": 256},
+    "bumpy_sphere": {"triangles": 10_000, "texture_size": 64},
+}
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +57,13 @@ def digest(asset: Asset) -> str:
     h = hashlib.sha256()
     for m in asset.meshes:
         maps = (m.material.base_color_texture, m.material.orm_texture, m.material.normal_texture)
-        for array in (m.positions, m.faces, m.normals, m.uvs, *(t.pixels for t in maps if t is not None)):
+        for array in (
+            m.positions,
+            m.faces,
+            m.normals,
+            m.uvs,
+            *(t.pixels for t in maps if t is not None),
+        ):
             h.update(np.ascontiguousarray(array).tobytes())
     return h.hexdigest()
 
@@ -65,7 +75,9 @@ def test_arrays_are_sound(assets: dict[str, Asset], name: str) -> None:
         assert mesh.positions.dtype == mesh.normals.dtype == mesh.uvs.dtype == np.float32
         assert mesh.faces.dtype == np.int32
         assert mesh.normals.shape == (count, 3) and mesh.uvs.shape == (count, 2)
-        assert np.array_equal(np.unique(mesh.faces), np.arange(count))  # all referenced, none out of range
+        assert np.array_equal(
+            np.unique(mesh.faces), np.arange(count)
+        )  # all referenced, none out of range
         assert np.isfinite(mesh.positions).all()
         assert mesh.uvs.min() >= 0 and mesh.uvs.max() <= 1
         assert np.abs(np.linalg.norm(mesh.normals, axis=1) - 1).max() < 1e-5
@@ -104,7 +116,10 @@ def test_torus_has_its_area_volume_and_genus(assets: dict[str, Asset]) -> None:
     assert twice_area(mesh).sum() / 2 == pytest.approx(4 * np.pi**2 * 0.75 * 0.25, rel=1e-3)
     assert volume(mesh) == pytest.approx(2 * np.pi**2 * 0.75 * 0.25**2, rel=3e-3)
     faces = welded(mesh)
-    edges = np.unique(np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1), axis=0)
+    edges = np.unique(
+        np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1),
+        axis=0,
+    )
     assert len(np.unique(faces)) - len(edges) + len(faces) == 0
 
 
@@ -175,7 +190,9 @@ def test_noise_is_periodic_and_of_unit_variance() -> None:
         u = np.linspace(0, 1, 401)
         values = noise(u, s, (40, 40), 3)
         assert np.allclose(values[:, 0], values[:, -1], atol=1e-5)
-        assert values.std() == pytest.approx(1, abs=0.05)  # 1600 lattice values: a standard error of 0.02
+        assert values.std() == pytest.approx(
+            1, abs=0.05
+        )  # 1600 lattice values: a standard error of 0.02
     first, second = cellular_noise(np.array([0.0, 1.0]), s, (8, 8), 3)
     assert np.allclose(first[:, 0], first[:, 1], atol=1e-5) and (second >= first).all()
 

@@ -1,4 +1,5 @@
-"""Single-sided faces: which backs matter, rays and triangles drawn onto pixels, gradients at their silhouettes."""
+"""Single-sided faces: which backs matter, rays and triangles drawn onto pixels, gradients at their
+silhouettes."""
 
 from __future__ import annotations
 
@@ -42,18 +43,27 @@ def joined(*parts: tuple[NDArray, NDArray]) -> tuple[NDArray, NDArray]:
     return np.concatenate([p for p, _ in parts]), np.concatenate(faces)
 
 
-def seen(p: NDArray, f: NDArray, hidden: NDArray | None, views: Views, n: int = 64) -> tuple[NDArray, NDArray]:
+def seen(
+    p: NDArray, f: NDArray, hidden: NDArray | None, views: Views, n: int = 64
+) -> tuple[NDArray, NDArray]:
     """(views, pixels) triangles that rays meet, and that are drawn."""
     g = Grid(len(views), n)
     at = g.view, g.column, g.row
     traced = rays.trace(
-        upload.scene_of(p, f, hidden), views.records(), g.view, mi.Float(g.column) + 0.5, mi.Float(g.row) + 0.5, g.size
+        upload.scene_of(p, f, hidden),
+        views.records(),
+        g.view,
+        mi.Float(g.column) + 0.5,
+        mi.Float(g.row) + 0.5,
+        g.size,
     )
     half = mi.Float(0.5)
     mask = None if hidden is None else mi.Bool(hidden)
     mesh = upload.packets(8, p), upload.index_packets(f), views.records()
     drawn, _ = raster.visible(*mesh, *at, half, half, g.size, g.rows, g.views, g.pixels, mask)
-    return np.array(traced.triangle).reshape(len(views), -1), np.array(drawn.triangle).reshape(len(views), -1)
+    return np.array(traced.triangle).reshape(len(views), -1), np.array(drawn.triangle).reshape(
+        len(views), -1
+    )
 
 
 def test_only_backs_that_can_be_seen_need_anything() -> None:
@@ -92,7 +102,9 @@ def test_two_triangles_back_to_back_are_no_solid() -> None:
 
 
 @pytest.mark.parametrize("other_diagonals", [False, True])
-def test_two_sheets_at_one_place_are_told_apart_by_the_side_they_look_to(other_diagonals: bool) -> None:
+def test_two_sheets_at_one_place_are_told_apart_by_the_side_they_look_to(
+    other_diagonals: bool,
+) -> None:
     p, f = sheet()
     if other_diagonals:  # flat, so that both lie at one place
         p = p - np.outer(p @ (normal := _normal(p, f)), normal).astype(np.float32)

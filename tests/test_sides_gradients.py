@@ -47,7 +47,12 @@ def back_to_back() -> LatentMesh:
 
 @pytest.mark.parametrize(
     ("make", "visibility"),
-    [(lambda: latent(*sheet()), "edges"), (bowl, "edges"), (bowl, "pairs"), (back_to_back, "edges")],
+    [
+        (lambda: latent(*sheet()), "edges"),
+        (bowl, "edges"),
+        (bowl, "pairs"),
+        (back_to_back, "edges"),
+    ],
     ids=["patch", "bowl", "bowl by pairs", "back to back"],
 )
 def test_silhouettes_carry_the_derivative_of_the_area_that_is_seen_of_fronts(
@@ -57,13 +62,19 @@ def test_silhouettes_carry_the_derivative_of_the_area_that_is_seen_of_fronts(
     mesh, views, grid = make(), SAMPLER.draw(1, 8), Grid(8, 64)
     model = Model(mesh, flat_maps(16), frozenset(("shape",)), Rates())
     assert model.topology.culled is not None and model.topology.culled.all()
-    quality = Quality(4.0, 8, 1) if visibility == "edges" else Quality(visibility="pairs", samples=4)
+    quality = (
+        Quality(4.0, 8, 1) if visibility == "edges" else Quality(visibility="pairs", samples=4)
+    )
     edges = model.topology.walkable if quality.walks else model.topology.edges
     weight = np.repeat(np.random.default_rng(0).uniform(0.5, 1.5, 8), 64 * 64)
     start = np.array(model.positions())
     positions = mi.Float(start)
     dr.enable_grad(positions)
-    surface, maps, records = model.surface(positions), model.maps(model.fitted_layer()), views.records()
+    surface, maps, records = (
+        model.surface(positions),
+        model.maps(model.fitted_layer()),
+        views.records(),
+    )
     batch = gradient.render(model.scene, surface, maps, edges, records, grid, quality, 0)
     by = np.zeros((grid.pixels, 4), np.float32)
     by[:, 3] = weight
@@ -77,13 +88,18 @@ def test_silhouettes_carry_the_derivative_of_the_area_that_is_seen_of_fronts(
     for field in fields:
         area = []
         for step in (0.01, -0.01):
-            model.parameters[POSITIONS].value = mi.Float((start + step * field.ravel()).astype(np.float32))
+            model.parameters[POSITIONS].value = mi.Float(
+                (start + step * field.ravel()).astype(np.float32)
+            )
             model.update_scene()
-            image = deferred.render_image(model.scene, model.surface(model.positions()), maps, records, grid, 64)
+            image = deferred.render_image(
+                model.scene, model.surface(model.positions()), maps, records, grid, 64
+            )
             area.append(float(np.array(image).reshape(-1, 4)[:, 3].astype(np.float64) @ weight))
         numeric.append((area[0] - area[1]) / 0.02)
         predicted.append(float(analytic @ field.ravel()))
-    # measured 0.2 to 0.7 % by edges, 1.3 % by pairs; where backs had silhouettes it would be 100 % back to back
+    # measured 0.2 to 0.7 % by edges, 1.3 % by pairs; where backs had silhouettes it would be 100 %
+    # back to back
     error = np.linalg.norm(np.subtract(predicted, numeric)) / np.linalg.norm(numeric)
     assert error < 0.03
 
@@ -91,11 +107,17 @@ def test_silhouettes_carry_the_derivative_of_the_area_that_is_seen_of_fronts(
 def test_frozen_steps_see_backs_turn() -> None:
     """Recorded kernels see sheets that move and turn over."""
     mesh = back_to_back()
-    model, grid, quality = Model(mesh, flat_maps(16), frozenset(("shape",)), Rates()), Grid(2, 32), Quality()
+    model, grid, quality = (
+        Model(mesh, flat_maps(16), frozenset(("shape",)), Rates()),
+        Grid(2, 32),
+        Quality(),
+    )
     frozen, plain = (Gradients(model, grid, quality, LOSSES["l2"], freeze=f) for f in (True, False))
     start = np.array(model.positions()).reshape(-1, 3)
     for k in range(5):
-        model.parameters[POSITIONS].value = mi.Float((start * (1, -1)[k % 2] * (1 - 0.05 * k)).ravel())
+        model.parameters[POSITIONS].value = mi.Float(
+            (start * (1, -1)[k % 2] * (1 - 0.05 * k)).ravel()
+        )
         model.update_scene()
         inputs = replace(make_inputs(model, grid, k), want_loss=True)
         (value, grads), (expected, wanted) = frozen(inputs), plain(inputs)

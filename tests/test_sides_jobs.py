@@ -1,4 +1,5 @@
-"""From single-sided faces of the input to those of the result: sheets back to back, rooms, both kinds in one asset."""
+"""From single-sided faces of the input to those of the result: sheets back to back, rooms, both
+kinds in one asset."""
 
 from __future__ import annotations
 
@@ -36,8 +37,12 @@ def picture(*color: float) -> Texture:
 def part(p: NDArray, f: NDArray, color: tuple[int, int, int], double_sided: bool = False) -> Mesh:
     low, high = p.min(axis=0), p.max(axis=0)
     uvs = ((p - low) / (high - low))[:, :2].astype(np.float32)
-    material = Material(base_color_texture=picture(*color), roughness=0.8, double_sided=double_sided)
-    return Mesh(np.ascontiguousarray(p), np.ascontiguousarray(f, np.int32), uvs=uvs, material=material)
+    material = Material(
+        base_color_texture=picture(*color), roughness=0.8, double_sided=double_sided
+    )
+    return Mesh(
+        np.ascontiguousarray(p), np.ascontiguousarray(f, np.int32), uvs=uvs, material=material
+    )
 
 
 def pages() -> Asset:
@@ -47,7 +52,8 @@ def pages() -> Asset:
 
 
 def hues(asset: Asset) -> list[NDArray]:
-    """Mean colour of the texels in the middle of each chart's faces, by orientation: (front, back)."""
+    """Mean colour of the texels in the middle of each chart's faces, by orientation: (front,
+    back)."""
     out = []
     for way in (1, -1):
         colors = []
@@ -125,7 +131,8 @@ def test_other_surfaces_stay_in_one_piece() -> None:
 
 
 def test_borders_between_sides_are_held() -> None:
-    """A flat square, one half of which is seen from both sides: the line between the halves costs triangles."""
+    """A flat square, one half of which is seen from both sides: the line between the halves costs
+    triangles."""
     n = 12
     y, x = np.mgrid[0 : n + 1, 0 : n + 1] / n
     p = np.stack([x, y, 0 * x], -1).reshape(-1, 3)
@@ -137,7 +144,9 @@ def test_borders_between_sides_are_held() -> None:
     middle = q[g].mean(axis=1)[:, 0]
     np.testing.assert_array_equal(middle > 0.5, single[source])
     corners = q[g]
-    area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    area = 0.5 * np.linalg.norm(
+        np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
+    )
     assert area[single[source]].sum() == pytest.approx(0.5, rel=1e-3)
 
 
@@ -145,11 +154,16 @@ def test_borders_between_sides_are_held() -> None:
 def test_results_with_both_kinds_of_faces_share_their_textures(form: str, tmp_path: Path) -> None:
     p, f = ball(100)
     mesh = unwrap(p, f, 32, single=p[f].mean(axis=1)[:, 0] > 0)
-    maps = {n: np.full((32, 32), 0.5, np.float32) for n in ("red", "green", "blue", "roughness", "metalness")}
+    maps = {
+        n: np.full((32, 32), 0.5, np.float32)
+        for n in ("red", "green", "blue", "roughness", "metalness")
+    }
     asset = to_asset(mesh, p, maps, "both")
     assert [m.material.double_sided for m in asset.meshes] == [True, False]
     assert sum(len(m.faces) for m in asset.meshes) == len(f)
-    assert asset.meshes[0].material.base_color_texture is asset.meshes[1].material.base_color_texture
+    assert (
+        asset.meshes[0].material.base_color_texture is asset.meshes[1].material.base_color_texture
+    )
     path = tmp_path / f"both.{form}"
     save(asset, path)
     again = load(path)
@@ -164,7 +178,9 @@ def test_results_with_both_kinds_of_faces_share_their_textures(form: str, tmp_pa
         assert [m["name"] for m in stored["materials"]] == ["both", "both_single_sided"]
     else:
         written = list(tmp_path.rglob("*.png"))
-        assert len(written) == (3 if form == "obj" else 2)  # roughness and metalness are two pictures in OBJ
+        assert len(written) == (
+            3 if form == "obj" else 2
+        )  # roughness and metalness are two pictures in OBJ
 
 
 @pytest.mark.parametrize("kind", [None, True, False])
@@ -185,7 +201,14 @@ def test_tessellated_faces_have_the_sides_of_their_base() -> None:
 
 
 def quick(**more: object) -> object:
-    common = {"steps": 2, "views": 2, "resolution": 64, "texture_size": 128, "reallocate": 0, "pool": 4}
+    common = {
+        "steps": 2,
+        "views": 2,
+        "resolution": 64,
+        "texture_size": 128,
+        "reallocate": 0,
+        "pool": 4,
+    }
     return simplify_options("draft", **{**common, **more})
 
 
@@ -203,7 +226,9 @@ def test_both_sides_of_a_sheet_show_their_own_picture() -> None:
 
 def test_what_stands_in_a_room_that_is_looked_into_is_kept() -> None:
     walls, thing = ball(300), ball(200, 0.5)
-    room = Asset((part(walls[0], walls[1][:, ::-1], (90, 90, 200)), part(*thing, (230, 20, 20))), "room")
+    room = Asset(
+        (part(walls[0], walls[1][:, ::-1], (90, 90, 200)), part(*thing, (230, 20, 20))), "room"
+    )
     closed = Asset((part(*walls, (90, 90, 200)), part(*thing, (230, 20, 20))), "closed")
     for heavy, kept in ((room, True), (closed, False)):
         result = simplify(heavy, None, quick(triangles=150))

@@ -8,7 +8,13 @@ import numpy as np
 import pytest
 
 from appearance_opt.asset import Texture, images, load
-from appearance_opt.asset.specular_glossiness import DIELECTRIC, Specular, constants, metallic, textures
+from appearance_opt.asset.specular_glossiness import (
+    DIELECTRIC,
+    Specular,
+    constants,
+    metallic,
+    textures,
+)
 from appearance_opt.asset.types import srgb_to_linear
 from tests.test_asset_gltf import triangle_document, write_glb
 
@@ -57,7 +63,11 @@ def test_textures_hold_what_constants_give() -> None:
 
 @pytest.mark.parametrize("textured", [False, True])
 def test_in_a_file(tmp_path: Path, textured: bool) -> None:
-    given: dict = {"diffuseFactor": [0, 0, 0, 1], "specularFactor": list(COLOR), "glossinessFactor": 0.75}
+    given: dict = {
+        "diffuseFactor": [0, 0, 0, 1],
+        "specularFactor": list(COLOR),
+        "glossinessFactor": 0.75,
+    }
     changes: dict = {}
     if textured:
         png = images.encode_png(np.full((2, 2, 4), (255, 255, 255, 255), np.uint8))

@@ -1,4 +1,5 @@
-"""The experiment that sets speed against error: looks that change nothing, fits that go on, fronts and tables."""
+"""The experiment that sets speed against error: looks that change nothing, fits that go on, fronts
+and tables."""
 
 from __future__ import annotations
 
@@ -16,7 +17,9 @@ from experiments.speed_vs_error.setups import DEFAULT, LEVERS, default_setup
 from tests.test_fit import make_fit
 
 
-def test_a_fit_that_is_stopped_and_gone_on_with_equals_one_that_is_not(ball: Asset, one_thread: float) -> None:
+def test_a_fit_that_is_stopped_and_gone_on_with_equals_one_that_is_not(
+    ball: Asset, one_thread: float
+) -> None:
     options = FitOptions(steps=8)
     whole, parts = Recorder(()), Recorder(())
     model, pool, _ = make_fit(ball)
@@ -28,9 +31,11 @@ def test_a_fit_that_is_stopped_and_gone_on_with_equals_one_that_is_not(ball: Ass
     assert [s.step for s in parts.snapshots] == [1, 8]
     for kind in ("values", "means"):
         for name, expected in getattr(whole.snapshots[-1], kind).items():
-            difference = np.abs(np.array(getattr(parts.snapshots[-1], kind)[name]) - np.array(expected))
-            # a GPU's thousands of threads: 95 % within 1.03e-5, the farthest 5e-3. Without Adam's moments the median
-            # alone is 2e-3
+            difference = np.abs(
+                np.array(getattr(parts.snapshots[-1], kind)[name]) - np.array(expected)
+            )
+            # a GPU's thousands of threads: 95 % within 1.03e-5, the farthest 5e-3. Without Adam's
+            # moments the median alone is 2e-3
             assert np.quantile(difference, 0.95) <= one_thread / 200
             assert difference.max() <= one_thread
 
@@ -48,7 +53,12 @@ def job(name: str, seconds: float, psnr: float) -> JobRow:
 
 
 def test_the_front_is_made_of_what_none_beats() -> None:
-    rows = [job("quick", 10, 30), job("worse", 20, 29), job("better", 20.3, 31), job("late", 60, 31.0)]
+    rows = [
+        job("quick", 10, 30),
+        job("worse", 20, 29),
+        job("better", 20.3, 31),
+        job("late", 60, 31.0),
+    ]
     assert tables.pareto(rows) == {"quick", "better"}
 
 
@@ -57,7 +67,11 @@ def row(lever: str, seconds: float, psnr: float, flip: float) -> CurveRow:
 
 
 def test_rows_are_kept_and_compared_after_equal_time(tmp_path: Path) -> None:
-    rows = [row(DEFAULT, 0, 20, 0.2), row(DEFAULT, 2, 30, 0.1), row("resolution x 1/2", 2, 29.5, 0.11)]
+    rows = [
+        row(DEFAULT, 0, 20, 0.2),
+        row(DEFAULT, 2, 30, 0.1),
+        row("resolution x 1/2", 2, 29.5, 0.11),
+    ]
     write(tmp_path / "rows.csv", rows, CurveRow)
     again = read(tmp_path / "rows.csv", CurveRow)
     assert again == rows

@@ -64,7 +64,8 @@ def test_a_face_that_stays_has_the_largest_weight_of_its_copies() -> None:
 
 
 def with_fin(tip: tuple[float, float, float]) -> tuple[np.ndarray, np.ndarray]:
-    """A plate of 8 x 8 squares with a triangle between ``tip`` and an edge from (0, 0) to (0.125, 0)."""
+    """A plate of 8 x 8 squares with a triangle between ``tip`` and an edge from (0, 0) to (0.125,
+    0)."""
     p, f = plate(8)
     a, b = 4 * 9 + 4, 4 * 9 + 5
     assert np.allclose(p[[a, b]], [(0, 0, 0), (0.125, 0, 0)])
@@ -105,8 +106,8 @@ def test_a_square_that_is_divided_both_ways_is_there_once() -> None:
 
 
 def stacked_plate(fans: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray, int]:
-    """A plate with flaps (two triangles over the same corners, of opposite sense) in its plane, 1 to 9 at an edge.
-    The number of its own faces comes last."""
+    """A plate with flaps (two triangles over the same corners, of opposite sense) in its plane, 1
+    to 9 at an edge. The number of its own faces comes last."""
     rng = np.random.default_rng(seed)
     p, f = plate(20)
     points, faces = [*p], [*f]
@@ -173,6 +174,8 @@ def test_copies_share_their_pixels_and_count_as_one() -> None:
     counts = rng.integers(100, 200, len(f))
     alone, _ = importance(p, f, counts)
     first = rng.integers(0, 100, len(f))
-    twice, visible = importance(p, np.concatenate([f, f[:, [1, 2, 0]]]), np.concatenate([first, counts - first]))
+    twice, visible = importance(
+        p, np.concatenate([f, f[:, [1, 2, 0]]]), np.concatenate([first, counts - first])
+    )
     np.testing.assert_allclose(twice, np.concatenate([alone, alone]), rtol=5e-3)
     assert visible.all()

@@ -155,12 +155,16 @@ def test_no_tile_at_all_is_a_missing_texture(tmp_path: Path) -> None:
     path = obj(tmp_path, "t_<UDIM>.png")
     with pytest.raises(InputError, match=r"t_<UDIM>\.png.*no tile.*--missing-textures ignore"):
         load(path)
-    assert all(m.material.base_color_texture is None for m in load(path, missing_textures="ignore").meshes)
+    assert all(
+        m.material.base_color_texture is None for m in load(path, missing_textures="ignore").meshes
+    )
     with pytest.raises(InputError, match=r"t_<UDIM>\.png.*no tile"):
         load(usd(tmp_path, "t_<UDIM>.png"))
 
 
-def test_faces_that_cross_tiles_are_counted_and_those_outside_keep_the_constants(tmp_path: Path) -> None:
+def test_faces_that_cross_tiles_are_counted_and_those_outside_keep_the_constants(
+    tmp_path: Path,
+) -> None:
     tiles(tmp_path)
     asset = load(obj(tmp_path, "t_<UDIM>.png", {0: (0.25, 0), 1: (-3, 0)}))
     assert [n for n in asset.notes if "2 faces cross the border of a tile" in n]

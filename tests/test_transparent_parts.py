@@ -1,4 +1,5 @@
-"""Transparent parts pass through jobs: what lies behind them stays, and they come out as they went in."""
+"""Transparent parts pass through jobs: what lies behind them stays, and they come out as they went
+in."""
 
 from __future__ import annotations
 
@@ -24,7 +25,9 @@ from appearance_opt.placement import Placement
 from tests.conftest import grid_sphere
 
 QUICK = {"texture_size": 64, "resolution": 48, "pool": 4, "views": 2, "steps": 0, "reallocate": 0}
-GLASS = Material("glass", (0.8, 0.9, 1.0), 0.05, opacity=0.2, alpha_mode="blend", double_sided=False)
+GLASS = Material(
+    "glass", (0.8, 0.9, 1.0), 0.05, opacity=0.2, alpha_mode="blend", double_sided=False
+)
 RED, BLUE = (0.7, 0.1, 0.1), (0.1, 0.1, 0.7)
 
 
@@ -38,7 +41,9 @@ def snow_globe() -> Asset:
     """A red ball in a glass ball, and a cut-out label on it."""
     alpha = np.zeros((8, 8, 4), np.uint8)
     alpha[:, 4:, 3] = 255
-    label = Material("label", base_color_texture=Texture(alpha, "srgb"), alpha_mode="mask", alpha_cutoff=0.25)
+    label = Material(
+        "label", base_color_texture=Texture(alpha, "srgb"), alpha_mode="mask", alpha_cutoff=0.25
+    )
     inside = ball(0.5, Material("paint", RED, 0.6), "ball")
     return Asset((ball(1.0, GLASS, "shell"), inside, ball(1.05, label, "sticker", 4)), "globe")
 
@@ -62,7 +67,9 @@ def check_kept(result: Asset, source: Asset) -> None:
                 assert before == after
 
 
-def test_simplified_beside_what_stays(tmp_path: Path, snow_globe: Asset, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_simplified_beside_what_stays(
+    tmp_path: Path, snow_globe: Asset, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(report, "RESOLUTION", 64)
     save(snow_globe, tmp_path / "globe.glb")
     source = load(tmp_path / "globe.glb")
@@ -74,7 +81,9 @@ def test_simplified_beside_what_stays(tmp_path: Path, snow_globe: Asset, monkeyp
     assert result.triangles <= 200
     assert (result.source_triangles, result.kept_triangles) == (len(source.meshes[1].faces), kept)
     told = "transparent parts pass into the result as they are, and count for no --triangles or --ratio: 2"
-    assert [n for n in result.notes if n.startswith(f"{told} ('shell', 'sticker') of {kept} triangles")]
+    assert [
+        n for n in result.notes if n.startswith(f"{told} ('shell', 'sticker') of {kept} triangles")
+    ]
     written = load(tmp_path / "low.glb")
     for asset in (result.asset, written):
         check_kept(asset, source)
@@ -102,7 +111,8 @@ def test_every_level_of_a_displaced_result_has_them(snow_globe: Asset) -> None:
 def test_nothing_left_to_work_on_is_refused(tmp_path: Path, snow_globe: Asset) -> None:
     clear = replace(snow_globe, meshes=snow_globe.meshes[::2])
     with pytest.raises(
-        InputError, match=r"^globe: all of it is transparent \('glass', 'label'\), .*nothing to simplify"
+        InputError,
+        match=r"^globe: all of it is transparent \('glass', 'label'\), .*nothing to simplify",
     ):
         appearance_opt.simplify(clear, None, options())
     baking = appearance_opt.bake_options(**{k: v for k, v in QUICK.items() if k != "reallocate"})
@@ -111,19 +121,31 @@ def test_nothing_left_to_work_on_is_refused(tmp_path: Path, snow_globe: Asset) -
             appearance_opt.bake(high, low, None, baking)
     save(clear, tmp_path / "clear.glb")
     with pytest.raises(InputError, match=r"--init .*clear.glb: all of it is transparent"):
-        appearance_opt.simplify(snow_globe, None, options(triangles=None, init=str(tmp_path / "clear.glb")))
+        appearance_opt.simplify(
+            snow_globe, None, options(triangles=None, init=str(tmp_path / "clear.glb"))
+        )
 
 
 def test_a_start_from_a_file_leaves_its_transparent_parts_out(snow_globe: Asset) -> None:
-    mesh, notes = atlas_of(snow_globe, Placement(), 5000, options(triangles=None, init="globe.glb"), np.zeros(1, bool))
+    mesh, notes = atlas_of(
+        snow_globe, Placement(), 5000, options(triangles=None, init="globe.glb"), np.zeros(1, bool)
+    )
     assert len(mesh.faces) == len(snow_globe.meshes[1].faces)
     assert "of --init are left out" in notes[0]
 
 
 def test_bakes_leave_them_alone(snow_globe: Asset) -> None:
-    """Glass around HIGH would be what rays from outside meet first; glass of LOW keeps its material."""
+    """Glass around HIGH would be what rays from outside meet first; glass of LOW keeps its
+    material."""
     low = Asset((ball(0.52, Material("low", BLUE), "low", 8), ball(1.1, GLASS, "pane", 6)), "low")
-    given = {**QUICK, "maps": ("material", "ao"), "ao_rays": 16, "closed_form": True, "hit": "outermost", "cage": 0.8}
+    given = {
+        **QUICK,
+        "maps": ("material", "ao"),
+        "ao_rays": 16,
+        "closed_form": True,
+        "hit": "outermost",
+        "cage": 0.8,
+    }
     chosen = appearance_opt.bake_options(**{k: v for k, v in given.items() if k != "reallocate"})
     result = appearance_opt.bake(snow_globe, low, None, chosen)
     check_kept(result.asset, low)
@@ -132,7 +154,9 @@ def test_bakes_leave_them_alone(snow_globe: Asset) -> None:
     # glass does not occlude
     assert result.maps["occlusion"][result.covered].mean() > 0.99
     assert any(n.startswith("transparent parts of HIGH are not baked: 2 (") for n in result.notes)
-    assert any(n.startswith("transparent parts of LOW stay as they are: 1 ('pane')") for n in result.notes)
+    assert any(
+        n.startswith("transparent parts of LOW stay as they are: 1 ('pane')") for n in result.notes
+    )
 
 
 def test_joint_bakes_leave_them_alone(snow_globe: Asset) -> None:
@@ -142,18 +166,30 @@ def test_joint_bakes_leave_them_alone(snow_globe: Asset) -> None:
     got = appearance_opt.joint(snow_globe, low, None, options_)
     for asset in (got.asset, got.start, got.shown):
         check_kept(asset, low)
-    assert (got.triangles, got.kept_triangles) == (len(low.meshes[1].faces), len(low.meshes[0].faces))
+    assert (got.triangles, got.kept_triangles) == (
+        len(low.meshes[1].faces),
+        len(low.meshes[0].faces),
+    )
 
 
 def test_what_is_aligned_is_aligned_whole(snow_globe: Asset) -> None:
     """By what is baked; HIGH's glass, of which a report's pictures show something, goes with it."""
     away = np.float32([3, -2, 1])
     moved = replace(
-        snow_globe, meshes=tuple(replace(m, positions=m.positions * np.float32(2) + away) for m in snow_globe.meshes)
+        snow_globe,
+        meshes=tuple(
+            replace(m, positions=m.positions * np.float32(2) + away) for m in snow_globe.meshes
+        ),
     )
     low = Asset((ball(0.5, Material("low", BLUE), "low", 16),), "low")
     parts = split(moved, "HIGH", "bake"), split(low, "LOW", "bake onto")
-    job = BakeJob(*parts, "LOW", appearance_opt.bake_options(align=True, unwrap=True), Stopwatch(), Interrupts())
+    job = BakeJob(
+        *parts,
+        "LOW",
+        appearance_opt.bake_options(align=True, unwrap=True),
+        Stopwatch(),
+        Interrupts(),
+    )
     for mesh, name in zip(job.high.meshes, ("ball", "shell", "sticker"), strict=True):
         expected = next(m for m in snow_globe.meshes if m.name == name)
         np.testing.assert_allclose(mesh.positions, expected.positions, atol=2e-3)
@@ -181,7 +217,9 @@ def test_parts_are_split_by_what_is_seen_of_them(snow_globe: Asset) -> None:
     assert [m.name for m in parts.kept] == ["shell", "sticker"]
     assert [m.name for m in parts.whole.meshes] == ["ball", "shell", "sticker"]
     # an asset that was not read from a file may say more than it means, too
-    solid = replace(snow_globe, meshes=(ball(1.0, replace(GLASS, opacity=1.0), "shell"), snow_globe.meshes[1]))
+    solid = replace(
+        snow_globe, meshes=(ball(1.0, replace(GLASS, opacity=1.0), "shell"), snow_globe.meshes[1])
+    )
     parts = split(solid, "x", "simplify")
     assert not parts.kept
     assert [kind_of(m.material) for m in parts.fitted.meshes] == ["opaque", "opaque"]

@@ -31,7 +31,9 @@ COLOR = (0.8, 0.4, 0.1)
 def ball(material: Material, x: float = 0.0) -> Mesh:
     positions, faces, uvs = grid_sphere(12, 24)
     normals = positions / np.linalg.norm(positions, axis=1, keepdims=True)
-    return Mesh(positions + np.float32([x, 0, 0]), faces, normals, uvs, material=material, name=f"ball{x:g}")
+    return Mesh(
+        positions + np.float32([x, 0, 0]), faces, normals, uvs, material=material, name=f"ball{x:g}"
+    )
 
 
 def image(asset: Asset, light: tuple[float, float, float]) -> np.ndarray:
@@ -49,11 +51,15 @@ def middle(picture: np.ndarray, x: float) -> np.ndarray:
 def test_an_unlit_surface_shows_its_colour_in_any_light(textured: bool) -> None:
     material = Material("u", COLOR, unlit=True)
     if textured:
-        material = replace(material, base_color_texture=Texture(np.full((8, 8, 3), 188, np.uint8), "srgb"))
+        material = replace(
+            material, base_color_texture=Texture(np.full((8, 8, 3), 188, np.uint8), "srgb")
+        )
     want = np.array(COLOR) * (float(srgb_to_linear(np.array([188 / 255]))[0]) if textured else 1.0)
     asset = Asset((ball(material),))
     for light in ((5.0, 5.0, 9.0), (-9.0, 0.0, -9.0)):
-        np.testing.assert_allclose(middle(image(asset, light), 0.0), want, rtol=2e-3)  # half precision
+        np.testing.assert_allclose(
+            middle(image(asset, light), 0.0), want, rtol=2e-3
+        )  # half precision
 
 
 def test_lit_and_unlit_parts_of_one_asset() -> None:
@@ -83,7 +89,9 @@ def test_unlit_assets_keep_colours_alone() -> None:
 def test_gradients_of_unlit_texels_agree_with_finite_differences() -> None:
     mesh = make_model().mesh
     size = 32
-    wave = 0.5 + 0.2 * np.sin(np.arange(size) / size * 2 * np.pi)[None, :].astype(np.float32).repeat(size, axis=0)
+    wave = 0.5 + 0.2 * np.sin(np.arange(size) / size * 2 * np.pi)[None, :].astype(
+        np.float32
+    ).repeat(size, axis=0)
     maps = {"red": wave, "green": 1 - wave, "blue": wave.T.copy(), UNLIT: 1.0}
     model = Model(mesh, maps, frozenset({"material"}), Rates())
     grid, quality, loss = Grid(2, 48), Quality(0.0, 1, 1), LOSSES["l2"]
@@ -108,7 +116,10 @@ def painted() -> Asset:
     """A ball whose picture is all there is of it."""
     asset = make_asset(16, 32)
     mesh = asset.meshes[0]
-    return replace(asset, meshes=(replace(mesh, material=replace(mesh.material, orm_texture=None, unlit=True)),))
+    return replace(
+        asset,
+        meshes=(replace(mesh, material=replace(mesh.material, orm_texture=None, unlit=True)),),
+    )
 
 
 SMALL = {"steps": 4, "resolution": 64, "texture_size": 64, "pool": 8, "views": 2, "seed": 3}
@@ -139,10 +150,16 @@ def test_unlit_parts_among_lit_ones_pass_through(tmp_path: Path) -> None:
 
 def test_what_is_baked_from_an_unlit_asset_is_unlit() -> None:
     high, low = painted(), make_asset(8, 16)
-    options = BakeOptions(maps=("base-color",), texture_size=64, steps=2, resolution=64, pool=8, views=2, cage=0.2)
+    options = BakeOptions(
+        maps=("base-color",), texture_size=64, steps=2, resolution=64, pool=8, views=2, cage=0.2
+    )
     material = bake(high, low, None, options).asset.meshes[0].material
     assert material.unlit
-    again = bake(make_asset(16, 32), painted(), None, replace(options, closed_form=True)).asset.meshes[0].material
+    again = (
+        bake(make_asset(16, 32), painted(), None, replace(options, closed_form=True))
+        .asset.meshes[0]
+        .material
+    )
     assert not again.unlit
 
 

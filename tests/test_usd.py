@@ -1,4 +1,5 @@
-"""USD beyond plain meshes: instancers, animation, creases, texture transforms, scales and biases of samplers."""
+"""USD beyond plain meshes: instancers, animation, creases, texture transforms, scales and biases of
+samplers."""
 
 from __future__ import annotations
 
@@ -19,7 +20,10 @@ TRIANGLE = (
     'uniform token subdivisionScheme = "none"\npoint3f[] points = [(0, 0, 0), (1, 0, 0), (0, 1, 0)]\n'
 )
 CUBE = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], np.float64)
-CUBE_FACES = Polygons(np.full(6, 4), np.array([0, 1, 3, 2, 4, 6, 7, 5, 0, 4, 5, 1, 2, 3, 7, 6, 0, 2, 6, 4, 1, 5, 7, 3]))
+CUBE_FACES = Polygons(
+    np.full(6, 4),
+    np.array([0, 1, 3, 2, 4, 6, 7, 5, 0, 4, 5, 1, 2, 3, 7, 6, 0, 2, 6, 4, 1, 5, 7, 3]),
+)
 
 
 def written(tmp_path: Path, text: str) -> Path:
@@ -29,7 +33,8 @@ def written(tmp_path: Path, text: str) -> Path:
 
 
 def test_point_instancers_draw_their_prototypes_where_they_say(tmp_path: Path) -> None:
-    """Twice the first prototype, once the second; the fourth instance is hidden, and prototypes are not drawn alone."""
+    """Twice the first prototype, once the second; the fourth instance is hidden, and prototypes are
+    not drawn alone."""
     path = written(
         tmp_path,
         f"""def PointInstancer "trees" {{
@@ -56,7 +61,10 @@ def test_point_instancers_draw_their_prototypes_where_they_say(tmp_path: Path) -
 }}""",
     )
     meshes = load(path).meshes
-    assert [(m.name, len(m.faces)) for m in meshes] == [("a", 2), ("inside", 1)]  # one mesh holds all its places
+    assert [(m.name, len(m.faces)) for m in meshes] == [
+        ("a", 2),
+        ("inside", 1),
+    ]  # one mesh holds all its places
     lows = sorted(tuple(p.min(axis=0)) for m in meshes for p in m.positions[m.faces])
     assert lows == [(10, 0, 5), (20, 6, 5), (30, 0, 5)]
 
@@ -79,14 +87,26 @@ def test_animated_meshes_are_read_at_their_first_frame(tmp_path: Path) -> None:
     [
         ("Cube", "double size = 3", (3, 3, 3), 27.0),
         ("Sphere", "double radius = 2", (4, 4, 4), 4 / 3 * np.pi * 8),
-        ("Cylinder", 'double radius = 1\ndouble height = 4\nuniform token axis = "X"', (4, 2, 2), 4 * np.pi),
-        ("Cone", 'double radius = 1\ndouble height = 3\nuniform token axis = "Y"', (2, 3, 2), np.pi),
+        (
+            "Cylinder",
+            'double radius = 1\ndouble height = 4\nuniform token axis = "X"',
+            (4, 2, 2),
+            4 * np.pi,
+        ),
+        (
+            "Cone",
+            'double radius = 1\ndouble height = 3\nuniform token axis = "Y"',
+            (2, 3, 2),
+            np.pi,
+        ),
         ("Capsule", "double radius = 1\ndouble height = 2", (2, 2, 4), 4 / 3 * np.pi + 2 * np.pi),
         ("Plane", 'double width = 1\ndouble length = 2\nuniform token axis = "Y"', (1, 0, 2), 0.0),
         ("Plane", 'double width = 1\ndouble length = 2\nuniform token axis = "X"', (0, 2, 1), 0.0),
     ],
 )
-def test_shapes_have_their_size(tmp_path: Path, shape: str, attributes: str, extent: tuple, volume: float) -> None:
+def test_shapes_have_their_size(
+    tmp_path: Path, shape: str, attributes: str, extent: tuple, volume: float
+) -> None:
     colour = 'color3f[] primvars:displayColor = [(1, 0.5, 0)] (interpolation = "constant")'
     mesh = load(written(tmp_path, f'def {shape} "s"\n{{\n{attributes}\n{colour}\n}}\n')).meshes[0]
     np.testing.assert_allclose(np.ptp(mesh.positions, axis=0), extent, atol=0.01)
@@ -131,7 +151,8 @@ def test_sharp_corners_stay() -> None:
 
 @pytest.mark.parametrize("lengths", ["[2]", "[3]"])
 def test_creases_of_a_file(tmp_path: Path, lengths: str) -> None:
-    """An open strip of two quads, folded; the crease runs along the fold, or does not fit the mesh."""
+    """An open strip of two quads, folded; the crease runs along the fold, or does not fit the
+    mesh."""
     path = written(
         tmp_path,
         """def Mesh "m"
@@ -159,7 +180,9 @@ def test_transforms_of_texture_coordinates_agree_with_their_definition() -> None
     c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
     expected = (st * scale) @ np.array([[c, -s], [s, c]]).T + move
     ours = apply(usd_affine(scale, degrees, move), np.stack([st[:, 0], 1 - st[:, 1]], axis=1))
-    np.testing.assert_allclose(ours, np.stack([expected[:, 0], 1 - expected[:, 1]], axis=1), atol=1e-12)
+    np.testing.assert_allclose(
+        ours, np.stack([expected[:, 0], 1 - expected[:, 1]], axis=1), atol=1e-12
+    )
 
 
 MATERIAL = """def Material "mat" {{
@@ -197,35 +220,55 @@ def Mesh "m" (prepend apiSchemas = ["MaterialBindingAPI"]) {{
     """
 
 
-def textured(tmp_path: Path, inputs: str, sampler: str = "", st: str = "reader.outputs:result") -> Path:
+def textured(
+    tmp_path: Path, inputs: str, sampler: str = "", st: str = "reader.outputs:result"
+) -> Path:
     images_ = np.full((4, 4, 3), (64, 192, 255), np.uint8)
     (tmp_path / "t.png").write_bytes(images.encode_png(images_))
-    return written(tmp_path, MATERIAL.format(inputs=inputs, sampler=sampler, st=st) + TRIANGLE + "}")
+    return written(
+        tmp_path, MATERIAL.format(inputs=inputs, sampler=sampler, st=st) + TRIANGLE + "}"
+    )
 
 
 def test_texture_transforms_move_the_coordinates(tmp_path: Path) -> None:
     inputs = "color3f inputs:diffuseColor.connect = </mat/t.outputs:rgb>"
     mesh = load(textured(tmp_path, inputs, st="move.outputs:result")).meshes[0]
     expected = np.array([(0.25, 0), (0.75, 0), (0.25, 0.5)])
-    at = [int(np.flatnonzero((mesh.positions == p).all(axis=1))[0]) for p in ([0, 0, 0], [1, 0, 0], [0, 1, 0])]
-    np.testing.assert_allclose(mesh.uvs[at], np.stack([expected[:, 0], 1 - expected[:, 1]], axis=1), atol=1e-6)
+    at = [
+        int(np.flatnonzero((mesh.positions == p).all(axis=1))[0])
+        for p in ([0, 0, 0], [1, 0, 0], [0, 1, 0])
+    ]
+    np.testing.assert_allclose(
+        mesh.uvs[at], np.stack([expected[:, 0], 1 - expected[:, 1]], axis=1), atol=1e-6
+    )
 
 
 def test_a_bias_becomes_part_of_the_texture(tmp_path: Path) -> None:
     inputs = "float inputs:roughness.connect = </mat/t.outputs:r>"
     material = (
-        load(textured(tmp_path, inputs, "float4 inputs:scale = (0.5, 1, 1, 1)\nfloat4 inputs:bias = (0.25, 0, 0, 0)"))
+        load(
+            textured(
+                tmp_path,
+                inputs,
+                "float4 inputs:scale = (0.5, 1, 1, 1)\nfloat4 inputs:bias = (0.25, 0, 0, 0)",
+            )
+        )
         .meshes[0]
         .material
     )
-    np.testing.assert_allclose(material.orm_texture.linear()[..., 1] * material.roughness, 0.25 + 32 / 255, atol=1e-5)
+    np.testing.assert_allclose(
+        material.orm_texture.linear()[..., 1] * material.roughness, 0.25 + 32 / 255, atol=1e-5
+    )
 
 
 @pytest.mark.parametrize(
     ("sampler", "expected"),
     [
         ("", (64, 192, 255)),
-        ("float4 inputs:scale = (2, 2, 2, 1)\nfloat4 inputs:bias = (-1, -1, -1, 0)", (64, 192, 255)),
+        (
+            "float4 inputs:scale = (2, 2, 2, 1)\nfloat4 inputs:bias = (-1, -1, -1, 0)",
+            (64, 192, 255),
+        ),
         ("float4 inputs:scale = (2, -2, 2, 1)\nfloat4 inputs:bias = (-1, 1, -1, 0)", (64, 63, 255)),
     ],
 )

@@ -1,4 +1,5 @@
-"""USD materials and bindings beyond the usual: specular workflow, opacity, several UV sets, sides, colours, skins."""
+"""USD materials and bindings beyond the usual: specular workflow, opacity, several UV sets, sides,
+colours, skins."""
 
 from __future__ import annotations
 
@@ -37,8 +38,12 @@ def test_the_specular_workflow_with_textures(tmp_path: Path) -> None:
     tint = tuple(np.float32([64, 192, 255]) / 255)
     color, _, metalness = constants(Specular((0, 0, 0), tint, 1.0))
     np.testing.assert_allclose(material.base_color_texture.linear()[0, 0], color, atol=0.005)
-    np.testing.assert_allclose(material.orm_texture.linear()[0, 0, 2] * material.metalness, metalness, atol=0.003)
-    np.testing.assert_allclose(material.orm_texture.linear()[0, 0, 1] * material.roughness, 0.3, atol=1e-6)
+    np.testing.assert_allclose(
+        material.orm_texture.linear()[0, 0, 2] * material.metalness, metalness, atol=0.003
+    )
+    np.testing.assert_allclose(
+        material.orm_texture.linear()[0, 0, 1] * material.roughness, 0.3, atol=1e-6
+    )
 
 
 @pytest.mark.parametrize(
@@ -52,16 +57,25 @@ def test_the_specular_workflow_with_textures(tmp_path: Path) -> None:
             1,
             64 / 255,
         ),
-        ("float inputs:opacity.connect = </mat/t.outputs:r>\nfloat inputs:opacityThreshold = 0.2", "opaque", 1, None),
+        (
+            "float inputs:opacity.connect = </mat/t.outputs:r>\nfloat inputs:opacityThreshold = 0.2",
+            "opaque",
+            1,
+            None,
+        ),
         ("float inputs:opacity.connect = </mat/t.outputs:a>", "opaque", 1, None),
         ("float inputs:opacity = 0.5", "blend", 0.5, None),
         ("float inputs:opacity = 0.5\nfloat inputs:opacityThreshold = 0.4", "opaque", 1, None),
         ("float inputs:opacity = 1\nfloat inputs:opacityThreshold = 0.4", "opaque", 1, None),
     ],
 )
-def test_opacity_becomes_alpha(tmp_path: Path, inputs: str, mode: str, opacity: float, alpha: float | None) -> None:
+def test_opacity_becomes_alpha(
+    tmp_path: Path, inputs: str, mode: str, opacity: float, alpha: float | None
+) -> None:
     path = textured(tmp_path, inputs)
-    path.write_text(path.read_text().replace("float outputs:r\n", "float outputs:r\nfloat outputs:a\n"))
+    path.write_text(
+        path.read_text().replace("float outputs:r\n", "float outputs:r\nfloat outputs:a\n")
+    )
     material = load(path).meshes[0].material
     assert (material.alpha_mode, material.opacity) == (mode, opacity)
     if alpha is not None:
@@ -73,7 +87,9 @@ def test_scale_and_bias_of_opacity_count(tmp_path: Path) -> None:
     inputs = "float inputs:opacity.connect = </mat/t.outputs:r>\ncolor3f inputs:diffuseColor = (0.2, 0.4, 0.6)"
     sampler = "float4 inputs:scale = (0.5, 1, 1, 1)\nfloat4 inputs:bias = (0.25, 0, 0, 0)"
     material = load(textured(tmp_path, inputs, sampler)).meshes[0].material
-    np.testing.assert_allclose(material.base_color_texture.linear()[..., 3], 0.25 + 32 / 255, atol=1e-6)
+    np.testing.assert_allclose(
+        material.base_color_texture.linear()[..., 3], 0.25 + 32 / 255, atol=1e-6
+    )
     np.testing.assert_allclose(material.base_color, (0.2, 0.4, 0.6), atol=1e-6)
 
 
@@ -133,7 +149,11 @@ def test_each_subset_has_its_own_texture_coordinates(tmp_path: Path) -> None:
 def test_sides_are_those_of_the_mesh(tmp_path: Path, ball: Asset, double: bool) -> None:
     path = textured(tmp_path, DIFFUSE_MAP)
     if double:
-        path.write_text(path.read_text().replace("rel material", "uniform bool doubleSided = 1\n    rel material"))
+        path.write_text(
+            path.read_text().replace(
+                "rel material", "uniform bool doubleSided = 1\n    rel material"
+            )
+        )
     assert load(path).meshes[0].material.double_sided is double
     mesh = replace(ball.meshes[0], material=replace(ball.meshes[0].material, double_sided=double))
     save(Asset((mesh,)), tmp_path / "y.usda")
@@ -150,7 +170,9 @@ def test_vertex_colours_survive_a_round_trip(tmp_path: Path) -> None:
     """One material, of a mesh with colours and of one without."""
     colors = np.array([[0.1, 0.5, 1], [0, 0.002, 0.9], [1, 0.25, 0.3]], np.float32)
     positions = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], np.float32)
-    mesh = Mesh(positions, np.array([[0, 1, 2]], np.int32), material=Material(base_color=(0.5, 1.0, 0.25)))
+    mesh = Mesh(
+        positions, np.array([[0, 1, 2]], np.int32), material=Material(base_color=(0.5, 1.0, 0.25))
+    )
     save(Asset((replace(mesh, colors=colors), mesh)), tmp_path / "x.usda")
     colored, plain = load(tmp_path / "x.usda").meshes
     at = [int(np.flatnonzero((colored.positions == p).all(axis=1))[0]) for p in positions]
@@ -161,7 +183,8 @@ def test_vertex_colours_survive_a_round_trip(tmp_path: Path) -> None:
 
 
 def test_skinned_meshes_keep_their_bind_pose(tmp_path: Path) -> None:
-    """The mesh's own transform does not count; geomBindTransform leads into the skeleton's frame."""
+    """The mesh's own transform does not count; geomBindTransform leads into the skeleton's
+    frame."""
     text = f"""def SkelRoot "figure" {{
     double3 xformOp:translate = (0, 0, 10)
     uniform token[] xformOpOrder = ["xformOp:translate"]
@@ -186,4 +209,7 @@ def test_skinned_meshes_keep_their_bind_pose(tmp_path: Path) -> None:
     asset = load(written(tmp_path, text))
     np.testing.assert_allclose(asset.meshes[0].positions.min(axis=0), [0, 5, 10])
     assert "'/figure/m': the bind pose is kept, skinning dropped" in asset.notes
-    assert any(note.startswith("'/figure/m': blend shapes: the shape of their default") for note in asset.notes)
+    assert any(
+        note.startswith("'/figure/m': blend shapes: the shape of their default")
+        for note in asset.notes
+    )

@@ -1,4 +1,5 @@
-"""What is written as USD: points welded by position, face-varying attributes; what is read back is the same."""
+"""What is written as USD: points welded by position, face-varying attributes; what is read back is
+the same."""
 
 from __future__ import annotations
 
@@ -15,13 +16,20 @@ from appearance_opt.asset.types import Asset, Material, Mesh
 from tests.conftest import grid_sphere
 
 CORNERS = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], np.float32)
-SIDES = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
-OUTWARD = np.array([[-1, 0, 0], [1, 0, 0], [0, -1, 0], [0, 1, 0], [0, 0, -1], [0, 0, 1]], np.float32)
+SIDES = np.array(
+    [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
+)
+OUTWARD = np.array(
+    [[-1, 0, 0], [1, 0, 0], [0, -1, 0], [0, 1, 0], [0, 0, -1], [0, 0, 1]], np.float32
+)
 
 
 def box() -> Mesh:
-    """A cube with hard edges: 24 vertices at 8 places, each side with texture coordinates of its own."""
-    faces = np.array([[4 * k, 4 * k + i, 4 * k + i + 1] for k in range(6) for i in (1, 2)], np.int32)
+    """A cube with hard edges: 24 vertices at 8 places, each side with texture coordinates of its
+    own."""
+    faces = np.array(
+        [[4 * k, 4 * k + i, 4 * k + i + 1] for k in range(6) for i in (1, 2)], np.int32
+    )
     square = np.array([[0, 0], [0, 1], [1, 1], [1, 0]], np.float32)
     uvs = np.concatenate([(square + (k % 3, k // 3)) / 4 for k in range(6)]).astype(np.float32)
     return Mesh(CORNERS[SIDES.ravel()], faces, np.repeat(OUTWARD, 4, axis=0), uvs)
@@ -31,7 +39,9 @@ def sphere() -> Mesh:
     """A smooth ball with a seam in its texture coordinates."""
     positions, faces, uvs = grid_sphere(8, 12)
     ends = positions[faces]
-    faces = faces[np.linalg.norm(np.cross(ends[:, 1] - ends[:, 0], ends[:, 2] - ends[:, 0]), axis=1) > 1e-6]
+    faces = faces[
+        np.linalg.norm(np.cross(ends[:, 1] - ends[:, 0], ends[:, 2] - ends[:, 0]), axis=1) > 1e-6
+    ]
     used, corners = np.unique(faces, return_inverse=True)
     p = positions[used].astype(np.float32)
     _, first, place = np.unique(np.round(p, 5), axis=0, return_index=True, return_inverse=True)
@@ -63,10 +73,14 @@ def written(path: Path) -> list[Written]:
     found = []
     for prim in (UsdGeom.Mesh(p) for p in stage.Traverse() if p.IsA(UsdGeom.Mesh)):
         primvars = {
-            p.GetPrimvarName(): Primvar(p.GetInterpolation(), len(p.Get()), len(p.ComputeFlattened()), p.IsIndexed())
+            p.GetPrimvarName(): Primvar(
+                p.GetInterpolation(), len(p.Get()), len(p.ComputeFlattened()), p.IsIndexed()
+            )
             for p in UsdGeom.PrimvarsAPI(prim).GetPrimvarsWithAuthoredValues()
         }
-        arrays = (np.array(a.Get()) for a in (prim.GetPointsAttr(), prim.GetFaceVertexIndicesAttr()))
+        arrays = (
+            np.array(a.Get()) for a in (prim.GetPointsAttr(), prim.GetFaceVertexIndicesAttr())
+        )
         found.append(Written(*arrays, primvars))
     return found
 
@@ -86,7 +100,9 @@ def assert_same_corners(got: Mesh, expected: Mesh) -> None:
         if values is None:
             assert getattr(got, name) is None
         else:
-            np.testing.assert_allclose(getattr(got, name)[got.faces], values[expected.faces], atol=1e-6)
+            np.testing.assert_allclose(
+                getattr(got, name)[got.faces], values[expected.faces], atol=1e-6
+            )
 
 
 @pytest.mark.parametrize("suffix", [".usda", ".usdc", ".usdz"])
@@ -104,7 +120,9 @@ def test_points_are_welded_and_what_differs_at_corners_stays(
     assert len(file.points) == places
     assert_valid(path)
     np.testing.assert_array_equal(file.points[corners], mesh.positions[mesh.faces.ravel()])
-    edges = np.sort(np.stack([corners, np.roll(corners.reshape(-1, 3), -1, axis=1).ravel()], axis=1), axis=1)
+    edges = np.sort(
+        np.stack([corners, np.roll(corners.reshape(-1, 3), -1, axis=1).ravel()], axis=1), axis=1
+    )
     assert (np.unique(edges, axis=0, return_counts=True)[1] == 2).all()  # closed, as the surface is
 
 
@@ -112,18 +130,28 @@ def test_each_attribute_is_face_varying_with_indices_where_that_is_smaller(tmp_p
     mesh = box()
     loose = Mesh(mesh.positions[mesh.faces.ravel()], np.arange(36, dtype=np.int32).reshape(12, 3))
     rng = np.random.default_rng(0)
-    loose = replace(loose, uvs=rng.random((36, 2)).astype(np.float32), normals=np.repeat(OUTWARD, 6, axis=0))
+    loose = replace(
+        loose, uvs=rng.random((36, 2)).astype(np.float32), normals=np.repeat(OUTWARD, 6, axis=0)
+    )
     save(Asset((mesh, loose)), tmp_path / "x.usda")
     shared, own = (m.primvars for m in written(tmp_path / "x.usda"))
-    assert shared == {"normals": Primvar("faceVarying", 6, 36, True), "st": Primvar("faceVarying", 12, 36, True)}
-    assert own == {"normals": Primvar("faceVarying", 6, 36, True), "st": Primvar("faceVarying", 36, 36, False)}
+    assert shared == {
+        "normals": Primvar("faceVarying", 6, 36, True),
+        "st": Primvar("faceVarying", 12, 36, True),
+    }
+    assert own == {
+        "normals": Primvar("faceVarying", 6, 36, True),
+        "st": Primvar("faceVarying", 36, 36, False),
+    }
     for got, expected in zip(load(tmp_path / "x.usda").meshes, (mesh, loose), strict=True):
         assert_same_corners(got, expected)
 
 
 def test_vertex_colours_and_their_alpha_belong_to_corners(tmp_path: Path) -> None:
     """Two triangles that meet in an edge, of different colours there."""
-    positions = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], np.float32)
+    positions = np.array(
+        [[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], np.float32
+    )
     colors = np.array([[1, 0, 0, 0.5]] * 3 + [[0, 0, 1, 0.25]] * 3, np.float32)
     up = np.tile(np.float32([0, 0, 1]), (6, 1))
     faces, glass = np.arange(6, dtype=np.int32).reshape(2, 3), Material(alpha_mode="blend")
@@ -134,13 +162,21 @@ def test_vertex_colours_and_their_alpha_belong_to_corners(tmp_path: Path) -> Non
 
 
 def test_both_zeros_are_one_place(tmp_path: Path) -> None:
-    positions = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [-0.0, -0.0, 0], [0, 1, -0.0], [-1, 0, 0]], np.float32)
-    mesh = Mesh(positions, np.arange(6, dtype=np.int32).reshape(2, 3), np.tile(np.float32([0, 0, 1]), (6, 1)))
+    positions = np.array(
+        [[0, 0, 0], [1, 0, 0], [0, 1, 0], [-0.0, -0.0, 0], [0, 1, -0.0], [-1, 0, 0]], np.float32
+    )
+    mesh = Mesh(
+        positions,
+        np.arange(6, dtype=np.int32).reshape(2, 3),
+        np.tile(np.float32([0, 0, 1]), (6, 1)),
+    )
     save(Asset((mesh,)), tmp_path / "x.usdc")
     assert len(written(tmp_path / "x.usdc")[0].points) == 4
 
 
-def test_parts_of_two_kinds_displaced_and_in_groups(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_parts_of_two_kinds_displaced_and_in_groups(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Many meshes, single- and double-sided ones in turn, all with a displacement map."""
     monkeypatch.setattr(usd_write, "SIBLINGS", 3)
     ramp = np.linspace(-0.1, 0.1, 16, dtype=np.float32).reshape(4, 4)
@@ -148,7 +184,11 @@ def test_parts_of_two_kinds_displaced_and_in_groups(tmp_path: Path, monkeypatch:
     kinds = [replace(material, double_sided=k % 2 == 0) for k in range(2)]
     shapes = [box(), sphere()]
     meshes = [
-        replace(shapes[k // 2 % 2], positions=shapes[k // 2 % 2].positions + np.float32(4 * k), material=kinds[k % 2])
+        replace(
+            shapes[k // 2 % 2],
+            positions=shapes[k // 2 % 2].positions + np.float32(4 * k),
+            material=kinds[k % 2],
+        )
         for k in range(8)
     ]
     save(Asset(tuple(meshes)), tmp_path / "x.usdc")

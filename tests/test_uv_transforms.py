@@ -1,4 +1,5 @@
-"""glTF textures of one material under transforms and wrap modes of their own, against the specification by hand."""
+"""glTF textures of one material under transforms and wrap modes of their own, against the
+specification by hand."""
 
 from __future__ import annotations
 
@@ -19,13 +20,23 @@ WRAPS = {"repeat": 10497, "clamp": 33071, "mirror": 33648}
 SLOTS = ("base_color_texture", "orm_texture", "normal_texture")
 
 
-def quad(path: Path, textures: list[tuple[np.ndarray, tuple[str, str], dict | None]], low: float, high: float) -> Asset:
-    """A quad with corners at (low, low) and (high, high) of the texture coordinates, its textures in the order of
-    ``SLOTS``: (pixels, wrap modes, KHR_texture_transform)."""
+def quad(
+    path: Path,
+    textures: list[tuple[np.ndarray, tuple[str, str], dict | None]],
+    low: float,
+    high: float,
+) -> Asset:
+    """A quad with corners at (low, low) and (high, high) of the texture coordinates, its textures
+    in the order of ``SLOTS``: (pixels, wrap modes, KHR_texture_transform)."""
     positions = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], np.float32)
     uvs = np.array([[low, low], [high, low], [high, high], [low, high]], np.float32)
     faces = np.array([0, 1, 2, 0, 2, 3], np.uint16)
-    chunks = [positions.tobytes(), uvs.tobytes(), faces.tobytes(), *(encode_png(p) for p, _, _ in textures)]
+    chunks = [
+        positions.tobytes(),
+        uvs.tobytes(),
+        faces.tobytes(),
+        *(encode_png(p) for p, _, _ in textures),
+    ]
     views, binary = [], b""
     for chunk in chunks:
         views.append({"buffer": 0, "byteOffset": len(binary), "byteLength": len(chunk)})
@@ -45,7 +56,13 @@ def quad(path: Path, textures: list[tuple[np.ndarray, tuple[str, str], dict | No
         "extensionsUsed": ["KHR_texture_transform"],
         "scenes": [{"nodes": [0]}],
         "nodes": [{"mesh": 0}],
-        "meshes": [{"primitives": [{"attributes": {"POSITION": 0, "TEXCOORD_0": 1}, "indices": 2, "material": 0}]}],
+        "meshes": [
+            {
+                "primitives": [
+                    {"attributes": {"POSITION": 0, "TEXCOORD_0": 1}, "indices": 2, "material": 0}
+                ]
+            }
+        ],
         "accessors": [
             {"bufferView": 0, "componentType": 5126, "count": 4, "type": "VEC3"},
             {"bufferView": 1, "componentType": 5126, "count": 4, "type": "VEC2"},
@@ -71,7 +88,9 @@ def wrapped(i: int, size: int, mode: str) -> int:
     return i if i < size else 2 * size - 1 - i
 
 
-def lookup(pixels: np.ndarray, wrap: tuple[str, str], transform: dict | None, u: float, v: float) -> np.ndarray:
+def lookup(
+    pixels: np.ndarray, wrap: tuple[str, str], transform: dict | None, u: float, v: float
+) -> np.ndarray:
     """Bilinear lookup as glTF 2.0 and KHR_texture_transform say: translation * rotation * scale."""
     t = transform or {}
     a, (sx, sy), (ox, oy) = t.get("rotation", 0.0), t.get("scale", (1, 1)), t.get("offset", (0, 0))
@@ -83,15 +102,23 @@ def lookup(pixels: np.ndarray, wrap: tuple[str, str], transform: dict | None, u:
     total = np.zeros(pixels.shape[2])
     for di, wx in ((0, 1 - x + i), (1, x - i)):
         for dj, wy in ((0, 1 - y + j), (1, y - j)):
-            total += wx * wy * pixels[wrapped(j + dj, height, wrap[1]), wrapped(i + di, width, wrap[0])]
+            total += (
+                wx * wy * pixels[wrapped(j + dj, height, wrap[1]), wrapped(i + di, width, wrap[0])]
+            )
     return total
 
 
 CASES = {
     "wraps": [((8, 8), ("repeat", "repeat"), None), ((8, 8), ("clamp", "clamp"), None)],
     "anisotropic": [((4, 8), ("repeat", "mirror"), None)],
-    "offset": [((8, 8), ("repeat", "repeat"), None), ((4, 4), ("repeat", "repeat"), {"offset": [0.25, 0.1]})],
-    "detail": [((8, 8), ("mirror", "repeat"), None), ((8, 8), ("repeat", "repeat"), {"scale": [3, 2]})],
+    "offset": [
+        ((8, 8), ("repeat", "repeat"), None),
+        ((4, 4), ("repeat", "repeat"), {"offset": [0.25, 0.1]}),
+    ],
+    "detail": [
+        ((8, 8), ("mirror", "repeat"), None),
+        ((8, 8), ("repeat", "repeat"), {"scale": [3, 2]}),
+    ],
     "turned": [
         ((8, 8), ("repeat", "repeat"), {"rotation": 0.5, "scale": [2, -1]}),
         ((4, 8), ("clamp", "mirror"), {"rotation": -0.25}),
@@ -133,7 +160,9 @@ def test_a_shared_transform_moves_the_coordinates_alone(tmp_path: Path) -> None:
     shared = {"scale": [2, 3], "offset": [0.5, 0.25]}
     asset = quad(tmp_path / "quad.glb", [(pixels, ("mirror", "mirror"), shared)] * 3, -1.0, 1.0)
     mesh = asset.meshes[0]
-    np.testing.assert_allclose(mesh.uvs, [[-1.5, -2.75], [2.5, -2.75], [2.5, 3.25], [-1.5, 3.25]], atol=1e-6)
+    np.testing.assert_allclose(
+        mesh.uvs, [[-1.5, -2.75], [2.5, -2.75], [2.5, 3.25], [-1.5, 3.25]], atol=1e-6
+    )
     for slot in SLOTS:
         np.testing.assert_array_equal(getattr(mesh.material, slot).pixels, pixels)
     assert not any("resampled" in note for note in asset.notes)
@@ -151,17 +180,27 @@ def test_what_would_be_too_large_is_left_with_a_note(tmp_path: Path) -> None:
     pixels = np.zeros((8, 8, 3), np.uint8)
     textures = [(pixels, ("repeat", "repeat"), None), (pixels, ("clamp", "clamp"), None)]
     asset = quad(tmp_path / "quad.glb", textures, 0.0, 10_000.0)
-    assert any("too large to be resampled: the first one's are used" in note for note in asset.notes)
+    assert any(
+        "too large to be resampled: the first one's are used" in note for note in asset.notes
+    )
     assert asset.meshes[0].uvs.max() == 10_000
 
 
-def two_sets(path: Path, color: np.ndarray, orm: np.ndarray, normal: np.ndarray | None, second) -> Asset:
-    """A grid over the unit square in x and y, its first texture coordinates (x, 1 - y). Base colour and normal map read
-    the second ones, which are ``second`` of the first; roughness and metalness the first."""
+def two_sets(
+    path: Path, color: np.ndarray, orm: np.ndarray, normal: np.ndarray | None, second
+) -> Asset:
+    """A grid over the unit square in x and y, its first texture coordinates (x, 1 - y). Base colour
+    and normal map read the second ones, which are ``second`` of the first; roughness and metalness
+    the first."""
     side = np.linspace(0, 1, 9)
     x, y = (c.ravel() for c in np.meshgrid(side, side))
     index = np.arange(81).reshape(9, 9)
-    a, b, c, d = index[:-1, :-1].ravel(), index[:-1, 1:].ravel(), index[1:, 1:].ravel(), index[1:, :-1].ravel()
+    a, b, c, d = (
+        index[:-1, :-1].ravel(),
+        index[:-1, 1:].ravel(),
+        index[1:, 1:].ravel(),
+        index[1:, :-1].ravel(),
+    )
     faces = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)]).astype(np.uint16)
     first = np.stack([x, 1 - y], 1).astype(np.float32)
     positions = np.stack([x, y, 0 * x], 1).astype(np.float32)
@@ -173,12 +212,21 @@ def two_sets(path: Path, color: np.ndarray, orm: np.ndarray, normal: np.ndarray 
     for chunk in chunks:
         views.append({"buffer": 0, "byteOffset": len(binary), "byteLength": len(chunk)})
         binary += chunk + b"\0" * (-len(chunk) % 4)
-    pbr = {"baseColorTexture": {"index": 0, "texCoord": 1}, "metallicRoughnessTexture": {"index": 1}}
+    pbr = {
+        "baseColorTexture": {"index": 0, "texCoord": 1},
+        "metallicRoughnessTexture": {"index": 1},
+    }
     material = {
         "pbrMetallicRoughness": pbr,
         **({} if normal is None else {"normalTexture": {"index": 2, "texCoord": 1}}),
     }
-    kinds = ((5126, "VEC3", 81), (5126, "VEC3", 81), (5126, "VEC2", 81), (5126, "VEC2", 81), (5123, "SCALAR", 384))
+    kinds = (
+        (5126, "VEC3", 81),
+        (5126, "VEC3", 81),
+        (5126, "VEC2", 81),
+        (5126, "VEC2", 81),
+        (5123, "SCALAR", 384),
+    )
     attributes = {"POSITION": 0, "NORMAL": 1, "TEXCOORD_0": 2, "TEXCOORD_1": 3}
     document = {
         "asset": {"version": "2.0"},
@@ -186,7 +234,8 @@ def two_sets(path: Path, color: np.ndarray, orm: np.ndarray, normal: np.ndarray 
         "nodes": [{"mesh": 0}],
         "meshes": [{"primitives": [{"attributes": attributes, "indices": 4, "material": 0}]}],
         "accessors": [
-            {"bufferView": k, "componentType": t, "count": n, "type": kind} for k, (t, kind, n) in enumerate(kinds)
+            {"bufferView": k, "componentType": t, "count": n, "type": kind}
+            for k, (t, kind, n) in enumerate(kinds)
         ],
         "materials": [material],
         "textures": [{"source": k} for k in range(len(pictures))],
@@ -210,7 +259,9 @@ def read_at(texture, uvs: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("scale", [(1.0, 1.0), (2.0, 1.0), (0.5, 3.0)])
-def test_textures_of_two_sets_of_coordinates_are_brought_into_one(tmp_path: Path, scale: tuple[float, float]) -> None:
+def test_textures_of_two_sets_of_coordinates_are_brought_into_one(
+    tmp_path: Path, scale: tuple[float, float]
+) -> None:
     color, orm = smooth(64, 2), smooth(64, 1)
     second = lambda uv: uv[:, ::-1] * scale + (0.25, 0.125)  # noqa: E731
     asset = two_sets(tmp_path / "x.glb", color, orm, None, second)
@@ -227,14 +278,20 @@ def test_textures_of_two_sets_of_coordinates_are_brought_into_one(tmp_path: Path
         want = read_at(replace(texture, pixels=pixels, wrap=("repeat", "repeat")), middle(at))
         got = read_at(texture, middle(mesh.uvs))
         assert np.abs(got - want).max() < 6  # of 255: twice interpolated, and rounded
-    assert [n for n in asset.notes if "resampled to one set" in n and "base color" in n and "orm" in n]
+    assert [
+        n for n in asset.notes if "resampled to one set" in n and "base color" in n and "orm" in n
+    ]
 
 
 def test_the_normal_map_turns_with_the_coordinates_it_is_drawn_into(tmp_path: Path) -> None:
-    """All faces lie over each other in the second set, which cannot lead; there u runs up and v to the right."""
+    """All faces lie over each other in the second set, which cannot lead; there u runs up and v to
+    the right."""
     color, orm = smooth(64, 1), smooth(64, 1)
     tilted = np.full((8, 8, 3), (230, 128, 200), np.uint8)  # towards the second set's u: up, +y
-    second = lambda uv: np.stack([np.round(8 * (1 - uv[:, 1])) % 2, np.round(8 * uv[:, 0]) % 2], axis=1)  # noqa: E731
+
+    def second(uv: np.ndarray) -> np.ndarray:
+        return np.stack([np.round(8 * (1 - uv[:, 1])) % 2, np.round(8 * uv[:, 0]) % 2], axis=1)
+
     asset = two_sets(tmp_path / "x.glb", color, orm, tilted, second)
     mesh = asset.meshes[0]
     normal = mesh.material.normal_texture

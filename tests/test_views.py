@@ -16,7 +16,8 @@ from appearance_opt.views import FIT, MEASURED, START, VALIDATION, VISIBILITY, V
 def test_results_are_measured_in_views_that_decided_nothing(
     ball: Asset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A job with moved triangles, and its report: the report's views chose neither the start nor the best state."""
+    """A job with moved triangles, and its report: the report's views chose neither the start nor
+    the best state."""
     seen: dict[int, set[bytes]] = defaultdict(set)
     whole = ViewSampler.draw
 
@@ -27,7 +28,14 @@ def test_results_are_measured_in_views_that_decided_nothing(
 
     monkeypatch.setattr(ViewSampler, "draw", draw)
     options = simplify_options(
-        triangles=200, texture_size=64, resolution=48, pool=16, views=2, steps=4, budget=None, reallocate=1
+        triangles=200,
+        texture_size=64,
+        resolution=48,
+        pool=16,
+        views=2,
+        steps=4,
+        budget=None,
+        reallocate=1,
     )
     appearance_opt.simplify(ball, tmp_path / "low.glb", options, report=tmp_path / "report")
     assert set(seen) == {FIT, VALIDATION, VISIBILITY, START, MEASURED}

@@ -33,16 +33,17 @@ def load(
     """Read an asset; the suffix chooses the format. Units become metres, the up axis +Y.
 
     ``refine``: level to which USD subdivision surfaces are refined. ``variants``: USD variant
-    selections by set name, instead of those in the file; for glTF, {"": name} chooses one of its material variants.
-    ``missing_textures``: "error" refuses an asset that names a texture file which is not there, "ignore" goes on
-    with the material's constants (without a normal map, if it is
-    that) and a note. ``root``: folder in which files that it refers to may lie, beside its own. ``crease_angle``:
-    of files that say nothing of normals (STL, some PLY and OBJ): degrees between the normals of two faces above which
-    the edge between them is hard; None: 40, and more where the surface is noisy. ``keep_layout``:
-    for a mesh to be baked onto, whose vertices and texture coordinates stay as the file has them: no transform of a
-    texture is applied to them, and vertices of a mesh without normals are not split at hard edges. Harmless
-    faults are repaired and noted in ``Asset.notes``, unless ``mend`` is off. Raises InputError for everything else,
-    naming the file.
+    selections by set name, instead of those in the file; for glTF, {"": name} chooses one of its
+    material variants. ``missing_textures``: "error" refuses an asset that names a texture file
+    which is not there, "ignore" goes on with the material's constants (without a normal map, if it
+    is that) and a note. ``root``: folder in which files that it refers to may lie, beside its own.
+    ``crease_angle``: of files that say nothing of normals (STL, some PLY and OBJ): degrees between
+    the normals of two faces above which the edge between them is hard; None: 40, and more where the
+    surface is noisy. ``keep_layout``: for a mesh to be baked onto, whose vertices and texture
+    coordinates stay as the file has them: no transform of a texture is applied to them, and
+    vertices of a mesh without normals are not split at hard edges. Harmless faults are repaired and
+    noted in ``Asset.notes``, unless ``mend`` is off. Raises InputError for everything else, naming
+    the file.
     """
     path = Path(path)
     if missing_textures not in CHOICES:
@@ -66,7 +67,9 @@ def load(
     # numbers that do not fit a float32 become infinite, which ``repair`` refuses by name
     with reading(path), np.errstate(over="ignore", invalid="ignore"):
         companions = Companions(missing_textures, None if root is None else Path(root))
-        asset = with_text_names(_read(path, suffix, refine, variants, companions, keep_layout, crease_angle))
+        asset = with_text_names(
+            _read(path, suffix, refine, variants, companions, keep_layout, crease_angle)
+        )
         asset = replace(asset, files=(path.resolve(), *dict.fromkeys(companions.files)))
         return repair(asset, str(path)) if mend else asset
 
@@ -104,16 +107,20 @@ def _read(
 
 
 def _name_of_variant(variants: dict[str, str] | None, path: Path) -> str | None:
-    """glTF has one set of variants, which has no name: what looks like one belongs to the variant's name."""
+    """glTF has one set of variants, which has no name: what looks like one belongs to the variant's
+    name."""
     names = ["=".join(filter(None, v)) for v in (variants or {}).items()]
     if len(names) > 1:
-        raise InputError(f"{path}: --variant {', '.join(names)}: glTF files show one variant at a time")
+        raise InputError(
+            f"{path}: --variant {', '.join(names)}: glTF files show one variant at a time"
+        )
     return names[0] if names else None
 
 
 def save(asset: Asset, path: str | Path) -> None:
-    """Write an asset; the suffix chooses the format. The files of a format that has several appear together or not at
-    all. Raises InputError for a format that cannot be written, OSError when the disk refuses."""
+    """Write an asset; the suffix chooses the format. The files of a format that has several appear
+    together or not at all. Raises InputError for a format that cannot be written, OSError when the
+    disk refuses."""
     path = Path(path)
     check_writable(path)
     with publishing(path) as place:
@@ -121,8 +128,8 @@ def save(asset: Asset, path: str | Path) -> None:
 
 
 def write(asset: Asset, path: Path) -> None:
-    """Write an asset's files where they are to be, one after the other: for places of a publication. Raises
-    OSError."""
+    """Write an asset's files where they are to be, one after the other: for places of a
+    publication. Raises OSError."""
     suffix = path.suffix.lower()
     if suffix in (".glb", ".gltf"):
         from appearance_opt.asset.gltf_write import save_gltf
@@ -142,25 +149,31 @@ def check_writable(path: Path) -> None:
     """Raise InputError if the format of ``path`` cannot be written, or its folder not be used."""
     suffix = path.suffix.lower()
     if suffix not in WRITABLE:
-        raise InputError(f"{path}: cannot write '{suffix}' files; choose one of {' '.join(WRITABLE)}")
+        raise InputError(
+            f"{path}: cannot write '{suffix}' files; choose one of {' '.join(WRITABLE)}"
+        )
     if path.is_dir():
         raise InputError(f"{path}: is a folder; name a file in it")
     _existing(path.parent, path)
 
 
 def check_folder(folder: Path) -> None:
-    """Raise InputError if files cannot be created in ``folder``, or it cannot be made. Leaves nothing behind."""
+    """Raise InputError if files cannot be created in ``folder``, or it cannot be made. Leaves
+    nothing behind."""
     import tempfile
 
     there = _existing(Path(folder), Path(folder))
     try:
         tempfile.TemporaryFile(dir=there).close()
     except OSError as error:
-        raise InputError(f"{folder}: nothing can be written there ({error.strerror}); choose another folder") from None
+        raise InputError(
+            f"{folder}: nothing can be written there ({error.strerror}); choose another folder"
+        ) from None
 
 
 def _existing(folder: Path, path: Path) -> Path:
-    """The nearest folder that exists, from ``folder`` upwards. Raises InputError if it is no folder."""
+    """The nearest folder that exists, from ``folder`` upwards. Raises InputError if it is no
+    folder."""
     while not folder.exists() and folder != folder.parent:
         folder = folder.parent
     if not folder.is_dir():

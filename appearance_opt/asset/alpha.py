@@ -1,6 +1,7 @@
 """Which parts of an asset can be seen through.
 
-Exporters write MASK and BLEND far more often than they mean it: what counts is the alpha that a mesh really shows.
+Exporters write MASK and BLEND far more often than they mean it: what counts is the alpha that a
+mesh really shows.
 """
 
 from __future__ import annotations
@@ -40,8 +41,8 @@ NAMED = 5
 
 
 def kind_of(material: Material) -> Kind:
-    """How a material is seen through, by its own words (see ``separate_opaque`` for materials that do
-    not mean them)."""
+    """How a material is seen through, by its own words (see ``separate_opaque`` for materials that
+    do not mean them)."""
     if material.transmission > 0:
         return "transmission"
     return material.alpha_mode
@@ -53,9 +54,10 @@ def seen_through(mesh: Mesh) -> bool:
 
 
 def coverage(material: Material) -> tuple[float, Texture | None]:
-    """(factor, linear texture of one channel or None): the share of the light behind it that a material keeps back,
-    for formats and renderers that know no transmission. It is alpha times 1 - t (1 - F), where t is the transmission
-    and F the reflectance at normal incidence; glTF 2.0, B.3.1: F = ((ior - 1) / (ior + 1))^2."""
+    """(factor, linear texture of one channel or None): the share of the light behind it that a
+    material keeps back, for formats and renderers that know no transmission. It is alpha times 1 -
+    t (1 - F), where t is the transmission and F the reflectance at normal incidence; glTF 2.0,
+    B.3.1: F = ((ior - 1) / (ior + 1))^2."""
     m = material
     alpha, factor = None, 1.0
     if m.alpha_mode != "opaque":
@@ -67,7 +69,10 @@ def coverage(material: Material) -> tuple[float, Texture | None]:
     if m.alpha_mode == "mask":  # what passes the test lets light through: no test is left
         values = np.ones((1, 1, 1), np.float32) if alpha is None else alpha.linear()
         test = (values * np.float32(factor) >= m.alpha_cutoff).astype(np.float32)
-        alpha, factor = Texture(test, "linear", ("repeat",) * 2 if alpha is None else alpha.wrap), 1.0
+        alpha, factor = (
+            Texture(test, "linear", ("repeat",) * 2 if alpha is None else alpha.wrap),
+            1.0,
+        )
     passing = m.transmission * (1 - ((m.ior - 1) / (m.ior + 1)) ** 2)
     through = m.transmission_texture
     if through is None:
@@ -90,11 +95,15 @@ class Share:
 
 
 def kept_apart(asset: Asset, by_light: bool = True) -> list[bool]:
-    """Which meshes take no part in a fit of what ``separate_opaque`` returns: those that are seen through, and
-    (``by_light``) unlit ones, unless all that is opaque is unlit, for one result cannot be both."""
+    """Which meshes take no part in a fit of what ``separate_opaque`` returns: those that are seen
+    through, and (``by_light``) unlit ones, unless all that is opaque is unlit, for one result
+    cannot be both."""
     clear = [seen_through(m) for m in asset.meshes]
     lit = any(not m.material.unlit for m, out in zip(asset.meshes, clear, strict=True) if not out)
-    return [out or (by_light and lit and m.material.unlit) for m, out in zip(asset.meshes, clear, strict=True)]
+    return [
+        out or (by_light and lit and m.material.unlit)
+        for m, out in zip(asset.meshes, clear, strict=True)
+    ]
 
 
 def count_kinds(asset: Asset) -> dict[str, Share]:
@@ -103,17 +112,23 @@ def count_kinds(asset: Asset) -> dict[str, Share]:
     found: dict[str, list[tuple[int, bool]]] = {kind: [] for kind in ("opaque", UNLIT, *KINDS[1:])}
     for mesh, out in zip(asset.meshes, apart, strict=True):
         kind = kind_of(mesh.material)
-        found[UNLIT if kind == "opaque" and mesh.material.unlit else kind].append((len(mesh.faces), out))
+        found[UNLIT if kind == "opaque" and mesh.material.unlit else kind].append(
+            (len(mesh.faces), out)
+        )
     becomes = {kind: KEPT if any(out for _, out in n) else FITTED for kind, n in found.items()}
-    return {k: Share(len(n), sum(count for count, _ in n), becomes[k]) for k, n in found.items() if n}
+    return {
+        k: Share(len(n), sum(count for count, _ in n), becomes[k]) for k, n in found.items() if n
+    }
 
 
 def separate_opaque(asset: Asset) -> Asset:
-    """The asset with what is opaque all over told apart from what is not, where materials speak of transparency.
+    """The asset with what is opaque all over told apart from what is not, where materials speak of
+    transparency.
 
-    Each connected part of a mesh is one or the other, by the alpha of the texels that its faces reach: one material may
-    be that of a body and of its hair. Opaque parts get an opaque material, and a mesh of their own where their mesh has
-    others; notes name the materials. Costs nothing without such materials.
+    Each connected part of a mesh is one or the other, by the alpha of the texels that its faces
+    reach: one material may be that of a body and of its hair. Opaque parts get an opaque material,
+    and a mesh of their own where their mesh has others; notes name the materials. Costs nothing
+    without such materials.
     """
     if not any(map(seen_through, asset.meshes)):
         return asset
@@ -127,7 +142,9 @@ def separate_opaque(asset: Asset) -> Asset:
             meshes.append(mesh)
             continue
         given = mesh.material
-        opaque = solid.setdefault(id(given), replace(given, alpha_mode="opaque", opacity=1.0, transmission=0.0))
+        opaque = solid.setdefault(
+            id(given), replace(given, alpha_mode="opaque", opacity=1.0, transmission=0.0)
+        )
         rest = _only(mesh, ~clear)
         colors = None if rest.colors is None else rest.colors[:, :3]
         meshes.append(replace(rest, material=opaque, colors=colors))
@@ -143,7 +160,9 @@ def separate_opaque(asset: Asset) -> Asset:
         )
     if mixed:
         told = f"{list_names(mixed)} ({sum(mixed.values())} triangles)"
-        notes.append(f"parts of transparent materials that are opaque all over are told apart from the others: {told}")
+        notes.append(
+            f"parts of transparent materials that are opaque all over are told apart from the others: {told}"
+        )
     return replace(asset, meshes=tuple(meshes), notes=(*asset.notes, *notes)) if notes else asset
 
 
@@ -183,7 +202,10 @@ class _Tests:
         """(F,) faces that light does not pass."""
         m, count = mesh.material, len(mesh.faces)
         if m.transmission > 0:  # a texture that takes it all back is not worth a search
-            nothing = m.transmission_texture is not None and not m.transmission_texture.pixels[..., 0].any()
+            nothing = (
+                m.transmission_texture is not None
+                and not m.transmission_texture.pixels[..., 0].any()
+            )
             return np.full(count, nothing)
         needed = m.alpha_cutoff if m.alpha_mode == "mask" else OPAQUE
         if needed <= 0:
@@ -199,8 +221,8 @@ class _Tests:
         return enough if sums is None else enough & (_counts(sums, mesh, texture) == 0)
 
     def _below(self, texture: Texture, needed: float) -> NDArray[np.int32] | None:
-        """(H + 1, W + 1) numbers of texels with less alpha than ``needed`` above and left of each corner of the grid;
-        None if there are none at all."""
+        """(H + 1, W + 1) numbers of texels with less alpha than ``needed`` above and left of each
+        corner of the grid; None if there are none at all."""
         key = id(texture), needed
         if key not in self._sums:
             alpha = texture.pixels[..., 3]
@@ -216,8 +238,9 @@ class _Tests:
 
 
 def _counts(sums: NDArray[np.int32], mesh: Mesh, texture: Texture) -> NDArray[np.int32]:
-    """(F,) marked texels in the boxes around the faces, of those that bilinear lookups reach. ``sums``: see
-    ``_Tests._below``. A face that crosses the border of the image, where it repeats, counts all of it."""
+    """(F,) marked texels in the boxes around the faces, of those that bilinear lookups reach.
+    ``sums``: see ``_Tests._below``. A face that crosses the border of the image, where it repeats,
+    counts all of it."""
     size = np.array(sums.shape[::-1]) - 1
     if mesh.uvs is None:
         return np.full(len(mesh.faces), sums[-1, -1])

@@ -1,4 +1,5 @@
-"""Pictures compressed by Basis Universal (KTX 2.0 and .basis files), through the optional package opengl-basisu."""
+"""Pictures compressed by Basis Universal (KTX 2.0 and .basis files), through the optional package
+opengl-basisu."""
 
 from __future__ import annotations
 
@@ -23,13 +24,15 @@ def is_basis(data: bytes) -> bool:
 
 
 def decode(data: bytes, name: str, largest: int, budget: Budget | None = None) -> NDArray[np.uint8]:
-    """(H, W, 3) pixels of the finest level, or (H, W, 4) with alpha, row 0 on top, no larger than ``largest``.
-    ``budget``: what they may take. Raises InputError."""
+    """(H, W, 3) pixels of the finest level, or (H, W, 4) with alpha, row 0 on top, no larger than
+    ``largest``. ``budget``: what they may take. Raises InputError."""
     try:
         import opengl_basisu
     except ImportError:
         needed = "compressed by Basis Universal, which needs the package opengl-basisu"
-        raise InputError(f"{name}: {needed}: pip install 'appearance-opt[basisu]', or save it as PNG") from None
+        raise InputError(
+            f"{name}: {needed}: pip install 'appearance-opt[basisu]', or save it as PNG"
+        ) from None
     try:
         texture = opengl_basisu.open(data)
         if max(texture.width, texture.height) > largest:
@@ -44,7 +47,9 @@ def decode(data: bytes, name: str, largest: int, budget: Budget | None = None) -
             f"{name}: only Basis Universal of 8 bits is read from KTX 2.0 ({reason}); save it as PNG"
         ) from None
     except opengl_basisu.BasisuError as error:
-        raise InputError(f"{name}: the image is damaged ({' '.join(str(error).split())}); export it again") from None
+        raise InputError(
+            f"{name}: the image is damaged ({' '.join(str(error).split())}); export it again"
+        ) from None
     if texture.y_flipped:
         pixels = pixels[::-1]
     return np.ascontiguousarray(pixels if texture.has_alpha else pixels[..., :3])

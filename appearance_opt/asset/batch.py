@@ -1,4 +1,5 @@
-"""Meshes one after the other in common arrays: a step over many small ones costs what one over a large one does."""
+"""Meshes one after the other in common arrays: a step over many small ones costs what one over a
+large one does."""
 
 from __future__ import annotations
 
@@ -60,7 +61,9 @@ class Batch:
     @cached_property
     def faces(self) -> NDArray[np.integer]:
         """(F, 3) corners by their number among all vertices, in 32 bits if these do."""
-        first = self.first_vertex.astype(np.int64 if self.vertex_counts.sum() >= 2**31 else np.int32)
+        first = self.first_vertex.astype(
+            np.int64 if self.vertex_counts.sum() >= 2**31 else np.int32
+        )
         return self.own_faces + first[self.mesh_of_face][:, None]
 
     def have(self, name: str) -> NDArray[np.bool_]:
@@ -68,8 +71,8 @@ class Batch:
         return np.array([getattr(m, name) is not None for m in self.meshes], bool)
 
     def joined(self, name: str, default: float = 0.0) -> NDArray:
-        """(V, width) an attribute of all meshes; ``default`` where one lacks it, or its last column (the alpha of
-        colours)."""
+        """(V, width) an attribute of all meshes; ``default`` where one lacks it, or its last column
+        (the alpha of colours)."""
         own = [getattr(m, name) for m in self.meshes]
         width = max((v.shape[1] for v in own if v is not None), default=WIDTHS[name][0])
         rows = []
@@ -83,15 +86,17 @@ class Batch:
         return np.concatenate(rows or [np.empty((0, width), np.float32)])
 
     def reindexed(self, index: NDArray, faces: NDArray, **attributes: NDArray | None) -> list[Mesh]:
-        """The meshes with new vertices and faces. ``index`` (N,): vertex that each new one comes from, in any order;
-        ``faces`` (F, 3): the same faces by their corners among the new vertices; ``attributes``: (N, width) new values
-        instead of the old, or None to drop one."""
+        """The meshes with new vertices and faces. ``index`` (N,): vertex that each new one comes
+        from, in any order; ``faces`` (F, 3): the same faces by their corners among the new
+        vertices; ``attributes``: (N, width) new values instead of the old, or None to drop one."""
         order = np.argsort(self.mesh_of_vertex[index], kind="stable")
         place = np.empty_like(order)
         place[order] = np.arange(len(order))
         old = index[order] - self.first_vertex[self.mesh_of_vertex[index[order]]]
         ends = np.cumsum(np.bincount(self.mesh_of_vertex[index], minlength=len(self.meshes)))
-        new = {name: None if values is None else values[order] for name, values in attributes.items()}
+        new = {
+            name: None if values is None else values[order] for name, values in attributes.items()
+        }
         corners, face_ends = place[faces], np.cumsum(self.face_counts).tolist()
         out, start, first_face = [], 0, 0
         for mesh, end, last_face in zip(self.meshes, ends.tolist(), face_ends, strict=True):
@@ -99,7 +104,9 @@ class Batch:
             changed: dict[str, Any] = {
                 name: values[rows] for name in WIDTHS if (values := getattr(mesh, name)) is not None
             }
-            changed |= {name: None if values is None else values[start:end] for name, values in new.items()}
+            changed |= {
+                name: None if values is None else values[start:end] for name, values in new.items()
+            }
             changed["faces"] = (corners[first_face:last_face] - start).astype(np.int32)
             out.append(replace(mesh, **changed))
             start, first_face = end, last_face
@@ -123,7 +130,9 @@ def fill_normals(meshes: Sequence[Mesh]) -> list[Mesh]:
     return replace_chosen(meshes, [m.normals is None for m in meshes], filled)
 
 
-def replace_chosen(meshes: Sequence[Mesh], chosen: Sequence[bool], change: Callable[[Batch], list[Mesh]]) -> list[Mesh]:
+def replace_chosen(
+    meshes: Sequence[Mesh], chosen: Sequence[bool], change: Callable[[Batch], list[Mesh]]
+) -> list[Mesh]:
     """The meshes, those that are chosen as ``change`` makes them, all in one go."""
     out = list(meshes)
     numbers = [k for k, yes in enumerate(chosen) if yes]

@@ -1,8 +1,9 @@
-"""The memory that reading one asset may take: asked for before it is allocated, refused with the number.
+"""The memory that reading one asset may take: asked for before it is allocated, refused with the
+number.
 
-A few bytes of a file can ask for any amount: pictures of one colour, accessors without data, instances of instances.
-What is counted here is what stays in memory while an asset is read, roughly; it protects the machine, and a reader
-need not be exact about it.
+A few bytes of a file can ask for any amount: pictures of one colour, accessors without data,
+instances of instances. What is counted here is what stays in memory while an asset is read,
+roughly; it protects the machine, and a reader need not be exact about it.
 """
 
 from __future__ import annotations
@@ -17,7 +18,8 @@ if TYPE_CHECKING:
     from appearance_opt.asset.types import Mesh
 
 SHARE = 0.5
-"""Share of the memory that is free which reading may take; what is made of the asset afterwards takes the rest."""
+"""Share of the memory that is free which reading may take; what is made of the asset afterwards
+takes the rest."""
 
 UNKNOWN = 8 << 30
 """Bytes allowed where the system does not say how much memory is free."""
@@ -36,13 +38,15 @@ def _allowed() -> int:
 
 @dataclass
 class Budget:
-    """``limit``: bytes that all of an asset may take together; ``used``: those that were taken so far."""
+    """``limit``: bytes that all of an asset may take together; ``used``: those that were taken so
+    far."""
 
     limit: int = field(default_factory=_allowed)
     used: int = 0
 
     def take(self, count: int, kind: str, owner: object) -> None:
-        """Count ``count`` more of a ``kind`` of ``BYTES``. Raises InputError, naming ``owner``, if that is too much."""
+        """Count ``count`` more of a ``kind`` of ``BYTES``. Raises InputError, naming ``owner``, if
+        that is too much."""
         self._add(count * BYTES[kind], f"{count:,} {kind}", owner)
 
     def take_copies(self, mesh: Mesh, copies: int, owner: object) -> None:

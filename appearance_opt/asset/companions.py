@@ -29,10 +29,10 @@ T = TypeVar("T")
 
 @dataclass
 class Companions:
-    """``policy``: refuse an asset that lacks a file, or go on without it. ``root``: folder in which files may
-    lie beside that of the file that names them. ``notes``: the reader's notes; each file that was ignored is named
-    there once. ``files``: absolute paths of what the asset consists of, read or only mentioned. ``budget``: the memory
-    that all of the asset may take."""
+    """``policy``: refuse an asset that lacks a file, or go on without it. ``root``: folder in which
+    files may lie beside that of the file that names them. ``notes``: the reader's notes; each file
+    that was ignored is named there once. ``files``: absolute paths of what the asset consists of,
+    read or only mentioned. ``budget``: the memory that all of the asset may take."""
 
     policy: MissingTextures = "error"
     root: Path | None = None
@@ -57,8 +57,8 @@ class Companions:
         return found
 
     def mention(self, reference: str, owner: Path, percent_encoded: bool = False) -> None:
-        """Note that ``owner`` refers to a file, which need not be read, nor be there: what nothing shows yet belongs
-        to the asset, too, and must not be replaced."""
+        """Note that ``owner`` refers to a file, which need not be read, nor be there: what nothing
+        shows yet belongs to the asset, too, and must not be replaced."""
         text = unquote(reference) if percent_encoded else reference
         with suppress(OSError, ValueError, RuntimeError):  # no file name
             path = (owner.resolve().parent / text.replace("\\", "/")).resolve()
@@ -68,8 +68,9 @@ class Companions:
     def _find(self, reference: str, owner: Path, percent_encoded: bool) -> Path:
         """Raises InputError as ``resolve`` does.
 
-        An absolute path names a place on the machine that wrote the file: where it leads nowhere, or to where nothing
-        may be read, a file of the same name beside ``owner`` or in ``root`` stands for it, with a note.
+        An absolute path names a place on the machine that wrote the file: where it leads nowhere,
+        or to where nothing may be read, a file of the same name beside ``owner`` or in ``root``
+        stands for it, with a note.
         """
         try:
             return resolve(reference, owner, percent_encoded, self.root)
@@ -78,12 +79,17 @@ class Companions:
             path = PureWindowsPath(unquote(reference) if percent_encoded else reference)
             if not path.root:
                 raise
-        for folder in (owner.resolve().parent, *([] if self.root is None else [self.root.resolve()])):
+        for folder in (
+            owner.resolve().parent,
+            *([] if self.root is None else [self.root.resolve()]),
+        ):
             try:
                 found = resolve(str(folder / path.name), owner, root=self.root)
             except MissingFileError:
                 continue
-            self.note(f"'{reference}' is not there or not to be read: '{found.name}' in {folder} stands for it")
+            self.note(
+                f"'{reference}' is not there or not to be read: '{found.name}' in {folder} stands for it"
+            )
             return found
         raise MissingFileError(
             f"{owner}: refers to '{reference[:200]}' outside its own folder, where there is no '{path.name[:80]}'; "
@@ -98,9 +104,11 @@ class Companions:
         """The same for a picture in memory, which errors call ``name``."""
         return images.decode(data, name, self.budget)
 
-    def read(self, file: Callable[[], T], instead: str = "the material's constants stand alone") -> T | None:
-        """What ``file`` reads; None if it is missing, or of no use for any other reason, and that is to be ignored.
-        ``instead``: what the note says becomes of it. Raises InputError."""
+    def read(
+        self, file: Callable[[], T], instead: str = "the material's constants stand alone"
+    ) -> T | None:
+        """What ``file`` reads; None if it is missing, or of no use for any other reason, and that
+        is to be ignored. ``instead``: what the note says becomes of it. Raises InputError."""
         try:
             return file()
         except (InputError, *DATA_FAULTS) as error:
@@ -108,6 +116,8 @@ class Companions:
                 if not isinstance(error, InputError):
                     raise
                 mend = "add the file, or" if isinstance(error, MissingFileError) else "or"
-                raise InputError(f"{error}; {mend} go on without it: --missing-textures ignore") from None
+                raise InputError(
+                    f"{error}; {mend} go on without it: --missing-textures ignore"
+                ) from None
             self.note(f"{error}: ignored, {instead}", f"files ignored, {instead}")
             return None

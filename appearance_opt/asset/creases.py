@@ -1,8 +1,8 @@
 """Normals of shapes that come without: smooth within smoothing sets, hard between them.
 
 Formats say in different ways which edges are smooth: by smoothing groups (OBJ), or not at all (STL,
-PLY). A face corner shares its normal with those corners at the same place that it reaches over smooth
-edges; vertices are split where there are several such sets.
+PLY). A face corner shares its normal with those corners at the same place that it reaches over
+smooth edges; vertices are split where there are several such sets.
 """
 
 from __future__ import annotations
@@ -28,36 +28,37 @@ SHARP = np.radians(40.0)
 CAD parts and their chamfers, but no facet of a cylinder of ten or more."""
 
 NOISE_FACTOR = 4.0
-"""An edge is hard only if its angle is this many times the roughness around it, see ``roughness``. Of a
-sphere whose vertices are displaced by a third of an edge, which makes 40 % of its edges sharp, 0.6 % of
-the vertices are split then, and 3 % with a factor of 3; the edges of 20 CAD parts stay hard with both."""
+"""An edge is hard only if its angle is this many times the roughness around it, see ``roughness``.
+Of a sphere whose vertices are displaced by a third of an edge, which makes 40 % of its edges sharp,
+0.6 % of the vertices are split then, and 3 % with a factor of 3; the edges of 20 CAD parts stay
+hard with both."""
 
 LOOSE_ENDS = 3
-"""How often the loose ends of creases are taken off: in noise, what is left is short. Creases of CAD
-parts end at borders and other creases."""
+"""How often the loose ends of creases are taken off: in noise, what is left is short. Creases of
+CAD parts end at borders and other creases."""
 
 FOLDED = np.cos(np.radians(179.0))
-"""Cosine of the angle from which on faces lie back to back: the rim of a sheet that is modelled with two
-sides is never smooth, for their normals cancel."""
+"""Cosine of the angle from which on faces lie back to back: the rim of a sheet that is modelled
+with two sides is never smooth, for their normals cancel."""
 
 FLAT = np.radians(1.0)
 """Angles up to about this count as flat: rounded coordinates bend planes by less."""
 
 TYPICAL = 1.2
-"""Of angles that are normally distributed the geometric mean is 0.53 deviations. So many times that is
-about what their mean size is after they have partly cancelled each other."""
+"""Of angles that are normally distributed the geometric mean is 0.53 deviations. So many times that
+is about what their mean size is after they have partly cancelled each other."""
 
 
 def smooth_by_angle(
     positions: NDArray, faces: NDArray, edges: Edges, crease_angle: float | None = None
 ) -> NDArray[np.bool_]:
-    """(E,) edges that are smooth in a file that says nothing of it: those whose faces' normals differ by
-    at most ``crease_angle`` degrees, if that is given.
+    """(E,) edges that are smooth in a file that says nothing of it: those whose faces' normals
+    differ by at most ``crease_angle`` degrees, if that is given.
 
     Else hard are those whose faces' normals differ by more than ``SHARP``, and by more than
     ``NOISE_FACTOR`` times the roughness at the smoother of their ends: so that a noisy scan stays
-    smooth. The loose ends of what is left are smooth as well (``LOOSE_ENDS``). ``faces``: of places, see
-    ``Edges``."""
+    smooth. The loose ends of what is left are smooth as well (``LOOSE_ENDS``). ``faces``: of
+    places, see ``Edges``."""
     p = np.asarray(positions, np.float64)
     if crease_angle is not None:
         return edges.cosine >= max(np.cos(np.radians(crease_angle)), FOLDED)
@@ -86,12 +87,14 @@ def smooth_by_angle(
 
 
 def add_normals(
-    meshes: Sequence[Mesh], groups: Sequence[NDArray] | None = None, crease_angle: float | None = None
+    meshes: Sequence[Mesh],
+    groups: Sequence[NDArray] | None = None,
+    crease_angle: float | None = None,
 ) -> list[Mesh]:
     """The meshes with normals where they have none, vertices split at hard edges. ``groups``: the
     smoothing groups (F,) of the faces of each mesh, 0 for none; without, angles decide
-    (``smooth_by_angle``). Meshes are one surface where they meet. Faces that ``repair`` refuses leave
-    their mesh as it is."""
+    (``smooth_by_angle``). Meshes are one surface where they meet. Faces that ``repair`` refuses
+    leave their mesh as it is."""
     out = list(meshes)
     lacking = [k for k, m in enumerate(meshes) if m.normals is None and in_range(m)]
     if not lacking:
@@ -106,7 +109,9 @@ def add_normals(
     else:
         smooth = smooth_by_group(np.concatenate([groups[k] for k in lacking]), edges)
     index, new, normals = split(positions, batch.faces, place, edges, smooth)
-    for k, mesh in zip(lacking, batch.reindexed(index, new, normals=normals, tangents=None), strict=True):
+    for k, mesh in zip(
+        lacking, batch.reindexed(index, new, normals=normals, tangents=None), strict=True
+    ):
         out[k] = mesh
     return out
 
@@ -114,11 +119,11 @@ def add_normals(
 def roughness(faces: NDArray, edges: Edges, bend: NDArray, vertices: int) -> NDArray[np.float64]:
     """(vertices,) how much the angles around a vertex cancel each other, radians.
 
-    ``bend`` (E,): angle between the faces' normals, negative where the surface is concave. Noise differs
-    from the edges of a shape in two ways, and roughness is the lesser of two measures of it over the
-    edges of the faces at a vertex: noise bends a surface to and fro, so that angles cancel out (their
-    mean size less the size of their mean); and it leaves nothing flat (their geometric mean). The
-    measure is averaged over the vertices of these faces.
+    ``bend`` (E,): angle between the faces' normals, negative where the surface is concave. Noise
+    differs from the edges of a shape in two ways, and roughness is the lesser of two measures of it
+    over the edges of the faces at a vertex: noise bends a surface to and fro, so that angles cancel
+    out (their mean size less the size of their mean); and it leaves nothing flat (their geometric
+    mean). The measure is averaged over the vertices of these faces.
     """
 
     def of_faces(values: NDArray) -> NDArray[np.float64]:
@@ -137,7 +142,8 @@ def roughness(faces: NDArray, edges: Edges, bend: NDArray, vertices: int) -> NDA
 
 
 def smooth_by_group(groups: NDArray, edges: Edges) -> NDArray[np.bool_]:
-    """(E,) edges within one smoothing group, of ``groups`` (F,), 0 for none; but not the rims of sheets."""
+    """(E,) edges within one smoothing group, of ``groups`` (F,), 0 for none; but not the rims of
+    sheets."""
     one, other = groups[edges.faces].T
     return (one == other) & (one != 0) & (edges.cosine >= FOLDED)
 
@@ -147,8 +153,8 @@ def split(
 ) -> tuple[NDArray[np.intp], NDArray[np.int32], NDArray[np.float32]]:
     """(vertex that each new vertex comes from, faces, angle-weighted unit normals).
 
-    ``faces`` (F, 3) refer to ``positions`` (V, 3), which lie at the places ``place`` (V,); ``edges`` are
-    those of the places.
+    ``faces`` (F, 3) refer to ``positions`` (V, 3), which lie at the places ``place`` (V,);
+    ``edges`` are those of the places.
     """
     places, vertices = int(place.max(initial=-1)) + 1, len(positions)
     corner, corner_place = faces.ravel().astype(np.int64), place[faces].ravel().astype(np.int64)

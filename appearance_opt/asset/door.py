@@ -1,4 +1,5 @@
-"""What stands around every reader: one error for whatever damaged data raises, and names that are text."""
+"""What stands around every reader: one error for whatever damaged data raises, and names that are
+text."""
 
 from __future__ import annotations
 
@@ -33,20 +34,22 @@ DATA_FAULTS = (
     zipfile.BadZipFile,
     zlib.error,
 )
-"""What data that is not as a reader expects can raise. Others (NameError, AssertionError, ImportError ...) can only be
-faults of our own, and stay what they are."""
+"""What data that is not as a reader expects can raise. Others (NameError, AssertionError,
+ImportError ...) can only be faults of our own, and stay what they are."""
 
 OUR_FAULTS = (NotImplementedError,)
 
 
 @contextmanager
 def reading(path: Path) -> Iterator[None]:
-    """Turn what damaged data raises into one InputError that names the file and the place where its reader stood, with
-    the exception as its cause. InputErrors and faults of our own pass."""
+    """Turn what damaged data raises into one InputError that names the file and the place where its
+    reader stood, with the exception as its cause. InputErrors and faults of our own pass."""
     try:
         yield
     except MemoryError as error:
-        raise InputError(f"{path}: asks for more memory than there is; it is damaged or too large") from error
+        raise InputError(
+            f"{path}: asks for more memory than there is; it is damaged or too large"
+        ) from error
     except OUR_FAULTS:
         raise
     except DATA_FAULTS as error:
@@ -59,25 +62,32 @@ def reading(path: Path) -> Iterator[None]:
 def _place(error: BaseException) -> str:
     """Where in this package an exception came from: ``module:line``."""
     package = Path(__file__).parent.parent
-    ours = [f for f in traceback.extract_tb(error.__traceback__) if package in Path(f.filename).parents]
+    ours = [
+        f for f in traceback.extract_tb(error.__traceback__) if package in Path(f.filename).parents
+    ]
     return f"{Path(ours[-1].filename).stem}:{ours[-1].lineno}" if ours else "a library"
 
 
 def with_text_names(asset: Asset) -> Asset:
-    """The asset with names that every writer takes: text without lone surrogates; and notes of one printable line."""
+    """The asset with names that every writer takes: text without lone surrogates; and notes of one
+    printable line."""
     renamed: dict[int, Material] = {}
     for mesh in asset.meshes:
         material = mesh.material
         if id(material) not in renamed:
             name = _text(material.name)
-            renamed[id(material)] = material if name == material.name else replace(material, name=name)
+            renamed[id(material)] = (
+                material if name == material.name else replace(material, name=name)
+            )
     meshes = []
     for mesh in asset.meshes:
         name, material = _text(mesh.name), renamed[id(mesh.material)]
         same = name == mesh.name and material is mesh.material
         meshes.append(mesh if same else replace(mesh, name=name, material=material))
     return replace(
-        asset, meshes=tuple(meshes), notes=tuple(one_line(without_stray_bytes(note)) for note in asset.notes)
+        asset,
+        meshes=tuple(meshes),
+        notes=tuple(one_line(without_stray_bytes(note)) for note in asset.notes),
     )
 
 

@@ -18,13 +18,13 @@ hundreds, pairs follow the order of the file."""
 class Edges:
     """Pairs of faces that run along an edge in opposite directions, as those of one surface do.
 
-    Where an edge has several faces, those are paired whose normals differ least, each once at most: the
-    two sides of a sheet that is modelled as two sheets back to back each keep together.
+    Where an edge has several faces, those are paired whose normals differ least, each once at most:
+    the two sides of a sheet that is modelled as two sheets back to back each keep together.
 
-    ``ends`` (E, 2): places at which an edge ends; ``faces`` (E, 2); ``corners`` (E, 2, 2): for both ends, the
-    corners (3 * face + number) of the two faces there; ``cosine`` (E,): of the angle between their
-    normals, 0 without one; ``several`` (E,): has the edge another pair? ``normals`` (F, 3): unit normals of
-    the faces, zero without area.
+    ``ends`` (E, 2): places at which an edge ends; ``faces`` (E, 2); ``corners`` (E, 2, 2): for both
+    ends, the corners (3 * face + number) of the two faces there; ``cosine`` (E,): of the angle
+    between their normals, 0 without one; ``several`` (E,): has the edge another pair? ``normals``
+    (F, 3): unit normals of the faces, zero without area.
     """
 
     ends: NDArray[np.int64]
@@ -52,16 +52,20 @@ class Edges:
         several[:-1] |= several[1:]
         between = np.stack([one // 3, other // 3], axis=1)
         cosine = _cosines(normals, between[:, 0], between[:, 1])
-        return cls(np.stack([start[one], end[one]], axis=1), between, corners, cosine, several, normals)
+        return cls(
+            np.stack([start[one], end[one]], axis=1), between, corners, cosine, several, normals
+        )
 
 
 def _cosines(normals: NDArray, one: NDArray, other: NDArray) -> NDArray[np.float64]:
     return np.clip(np.sum(normals[one] * normals[other], axis=1), -1, 1)
 
 
-def _pairs(key: NDArray, start: NDArray, end: NDArray, normals: NDArray) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Half edges of opposite directions, (E,) and (E,), in the order of their ``key``. ``start``, ``end``: of
-    half edges, three for each face."""
+def _pairs(
+    key: NDArray, start: NDArray, end: NDArray, normals: NDArray
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Half edges of opposite directions, (E,) and (E,), in the order of their ``key``. ``start``,
+    ``end``: of half edges, three for each face."""
     forward, backward = np.flatnonzero(start < end), np.flatnonzero(start > end)
     forward = forward[np.argsort(key[forward], kind="stable")]
     backward = backward[np.argsort(key[backward], kind="stable")]
@@ -80,17 +84,23 @@ def _pairs(key: NDArray, start: NDArray, end: NDArray, normals: NDArray) -> tupl
         return one, other
     count = (stop - begin)[choose]
     k = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
-    one_of, other_of = np.repeat(forward[choose], count), backward[np.repeat(begin[choose], count) + k]
+    one_of, other_of = (
+        np.repeat(forward[choose], count),
+        backward[np.repeat(begin[choose], count) + k],
+    )
     best = _best(key[one_of], one_of, other_of, _cosines(normals, one_of // 3, other_of // 3))
     kept = ~np.isin(one, forward[choose])
-    one, other = np.concatenate([one[kept], one_of[best]]), np.concatenate([other[kept], other_of[best]])
+    one, other = (
+        np.concatenate([one[kept], one_of[best]]),
+        np.concatenate([other[kept], other_of[best]]),
+    )
     order = np.argsort(key[one], kind="stable")
     return one[order], other[order]
 
 
 def _best(key: NDArray, one: NDArray, other: NDArray, cosine: NDArray) -> NDArray[np.int64]:
-    """Which of the pairs of half edges (N,) to take, each half edge once: of those of one ``key`` those of
-    the largest cosine first."""
+    """Which of the pairs of half edges (N,) to take, each half edge once: of those of one ``key``
+    those of the largest cosine first."""
     left = np.lexsort((-cosine, key))
     taken = np.zeros(int(max(one.max(), other.max())) + 1, bool)
     chosen = []

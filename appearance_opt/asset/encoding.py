@@ -17,11 +17,13 @@ if TYPE_CHECKING:
 
 
 def encoded_for(texture: Texture, space: ColorSpace, factor: Sequence[float] = (1.0,)) -> NDArray:
-    """8- or 16-bit pixels (H, W, C) of a texture for a slot whose colours are encoded as ``space`` says (glTF 2.0,
+    """8- or 16-bit pixels (H, W, C) of a texture for a slot whose colours are encoded as ``space``
+    says (glTF 2.0,
     3.9.2: base colour and emission sRGB, everything else linear).
 
-    Integers that are encoded so already stay as they are; others keep their depth, floats become 8 bits, clamped to
-    [0, 1]. ``factor``: what the linear colours are multiplied by. A fourth channel (alpha) is linear in every slot.
+    Integers that are encoded so already stay as they are; others keep their depth, floats become 8
+    bits, clamped to [0, 1]. ``factor``: what the linear colours are multiplied by. A fourth channel
+    (alpha) is linear in every slot.
     """
     pixels = texture.pixels
     scaled = any(f != 1.0 for f in factor)

@@ -22,11 +22,19 @@ if TYPE_CHECKING:
 
     from appearance_opt.asset.companions import Companions
 
-COMPONENTS = {5120: np.int8, 5121: np.uint8, 5122: np.int16, 5123: np.uint16, 5125: np.uint32, 5126: np.float32}
+COMPONENTS = {
+    5120: np.int8,
+    5121: np.uint8,
+    5122: np.int16,
+    5123: np.uint16,
+    5125: np.uint32,
+    5126: np.float32,
+}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
 FREE_ZEROS = 1 << 16
-"""Elements that an accessor without data, which stands for zeros, may have in any file. Beyond that it has no more than
-the largest accessor with data: a few bytes of JSON must not ask for any amount of memory and time."""
+"""Elements that an accessor without data, which stands for zeros, may have in any file. Beyond that
+it has no more than the largest accessor with data: a few bytes of JSON must not ask for any amount
+of memory and time."""
 _MAGIC, _JSON, _BIN = 0x46546C67, 0x4E4F534A, 0x004E4942
 
 
@@ -81,8 +89,8 @@ class Document:
         return self._decompressed[index], view.get("byteStride", 0)
 
     def accessor(self, index: int) -> NDArray:
-        """(count, width) array, not to be written to: floats for float and normalized types, integers otherwise. Each
-        is read once."""
+        """(count, width) array, not to be written to: floats for float and normalized types,
+        integers otherwise. Each is read once."""
         if index not in self._accessors:
             self._accessors[index] = self._read_accessor(index)
         return self._accessors[index]
@@ -93,14 +101,20 @@ class Document:
         if "bufferView" in a:
             out = self._elements(a["bufferView"], a.get("byteOffset", 0), kind, width, count)
         elif count > max(FREE_ZEROS, self._most_elements):
-            raise InputError(f"{self.path}: accessor {index} has {count} elements but no data; the file is damaged")
+            raise InputError(
+                f"{self.path}: accessor {index} has {count} elements but no data; the file is damaged"
+            )
         else:
             out = np.zeros((count, width), kind)
         if "sparse" in a:
             s = a["sparse"]
             at = s["indices"]
             where = self._elements(
-                at["bufferView"], at.get("byteOffset", 0), np.dtype(COMPONENTS[at["componentType"]]), 1, s["count"]
+                at["bufferView"],
+                at.get("byteOffset", 0),
+                np.dtype(COMPONENTS[at["componentType"]]),
+                1,
+                s["count"],
             )
             out = out.copy()
             out[where[:, 0]] = self._elements(
@@ -119,7 +133,8 @@ class Document:
         return most
 
     def scaled(self, index: int, stored: NDArray) -> NDArray:
-        """What the numbers ``stored`` of an accessor mean: floats in [-1, 1] if it is normalized, else themselves."""
+        """What the numbers ``stored`` of an accessor mean: floats in [-1, 1] if it is normalized,
+        else themselves."""
         a = self.items("accessors")[index]
         kind = np.dtype(COMPONENTS[a["componentType"]])
         if a.get("normalized") and kind.kind != "f":
@@ -129,21 +144,36 @@ class Document:
     def _elements(self, view: int, offset: int, kind: np.dtype, width: int, count: int) -> NDArray:
         data, stride = self.buffer_view(view)
         stride = stride or kind.itemsize * width
-        if count < 0 or offset < 0 or (count and offset + stride * (count - 1) + kind.itemsize * width > len(data)):
-            raise InputError(f"{self.path}: an accessor reaches beyond its buffer view; the file is cut short")
-        return np.ndarray((count, width), kind.newbyteorder("<"), data, offset, (stride, kind.itemsize))
+        if (
+            count < 0
+            or offset < 0
+            or (count and offset + stride * (count - 1) + kind.itemsize * width > len(data))
+        ):
+            raise InputError(
+                f"{self.path}: an accessor reaches beyond its buffer view; the file is cut short"
+            )
+        return np.ndarray(
+            (count, width), kind.newbyteorder("<"), data, offset, (stride, kind.itemsize)
+        )
 
     def _slice(self, extent: dict[str, Any], index: int) -> memoryview:
         data = self._buffer(extent["buffer"])
         start, length = extent.get("byteOffset", 0), extent["byteLength"]
         if start < 0 or length < 0 or start + length > len(data):
-            raise InputError(f"{self.path}: buffer view {index} reaches beyond its buffer; the file is cut short")
+            raise InputError(
+                f"{self.path}: buffer view {index} reaches beyond its buffer; the file is cut short"
+            )
         return memoryview(data)[start : start + length]
 
-    def _decompress(self, view: dict[str, Any], packed: dict[str, Any], index: int) -> bytes | memoryview:
-        """A view's plain bytes; those of its fallback buffer if the package is missing and there is one."""
+    def _decompress(
+        self, view: dict[str, Any], packed: dict[str, Any], index: int
+    ) -> bytes | memoryview:
+        """A view's plain bytes; those of its fallback buffer if the package is missing and there is
+        one."""
         try:
-            return gltf_meshopt.decompress(bytes(self._slice(packed, index)), packed, str(self.path))
+            return gltf_meshopt.decompress(
+                bytes(self._slice(packed, index)), packed, str(self.path)
+            )
         except gltf_meshopt.PackageMissing:
             if "uri" not in self.items("buffers")[view["buffer"]]:
                 raise
@@ -188,5 +218,6 @@ def _chunks(data: bytes, path: Path) -> tuple[bytes, bytes | None]:
 
 
 def _decoded(text: bytes) -> str:
-    """JSON as text. Names in it that are no UTF-8, which JSON asks for, keep their bytes (see ``paths.resolve``)."""
+    """JSON as text. Names in it that are no UTF-8, which JSON asks for, keep their bytes (see
+    ``paths.resolve``)."""
     return text.removeprefix(codecs.BOM_UTF8).decode("utf-8", "surrogateescape")

@@ -1,4 +1,5 @@
-"""Geometry that glTF holds compressed by Draco (KHR_draco_mesh_compression), through the optional package DracoPy."""
+"""Geometry that glTF holds compressed by Draco (KHR_draco_mesh_compression), through the optional
+package DracoPy."""
 
 from __future__ import annotations
 
@@ -19,8 +20,8 @@ DRACO = "KHR_draco_mesh_compression"
 
 @dataclass(frozen=True)
 class Compressed:
-    """The triangles of a primitive, ``faces`` (F, 3), and those of its attributes that are compressed, by ``name in``
-    and ``attribute(name)``."""
+    """The triangles of a primitive, ``faces`` (F, 3), and those of its attributes that are
+    compressed, by ``name in`` and ``attribute(name)``."""
 
     faces: NDArray[np.int64]
     _document: Document
@@ -29,8 +30,8 @@ class Compressed:
 
     @classmethod
     def of(cls, document: Document, primitive: dict[str, Any]) -> Compressed | None:
-        """None if the primitive is not compressed, or if the package is missing and the file has the same geometry
-        uncompressed. Raises InputError if it cannot be read."""
+        """None if the primitive is not compressed, or if the package is missing and the file has
+        the same geometry uncompressed. Raises InputError if it cannot be read."""
         extension = primitive.get("extensions", {}).get(DRACO)
         if extension is None:
             return None
@@ -48,8 +49,12 @@ class Compressed:
             mesh = DracoPy.decode(data)
             faces = np.asarray(mesh.faces, np.int64).reshape(-1, 3)
             by_id = {a["unique_id"]: np.asarray(a["data"]) for a in mesh.attributes}
-        except Exception as error:  # the decoder raises types of its own, and a cloud of points has no faces
-            raise InputError(f"{document.path}: its Draco data is damaged ({type(error).__name__})") from error
+        except (
+            Exception
+        ) as error:  # the decoder raises types of its own, and a cloud of points has no faces
+            raise InputError(
+                f"{document.path}: its Draco data is damaged ({type(error).__name__})"
+            ) from error
         stored = {name: by_id[number] for name, number in extension["attributes"].items()}
         return cls(faces, document, stored, primitive["attributes"])
 
@@ -63,5 +68,8 @@ class Compressed:
 
 def _has_fallback(document: Document, primitive: dict[str, Any]) -> bool:
     """Do all accessors of a primitive have data of their own?"""
-    used = [*primitive["attributes"].values(), *([primitive["indices"]] if "indices" in primitive else [])]
+    used = [
+        *primitive["attributes"].values(),
+        *([primitive["indices"]] if "indices" in primitive else []),
+    ]
     return all("bufferView" in document.items("accessors")[k] for k in used)

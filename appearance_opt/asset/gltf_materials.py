@@ -27,15 +27,23 @@ UNLIT = "KHR_materials_unlit"
 TRANSMISSION, VOLUME, IOR = (f"KHR_materials_{name}" for name in ("transmission", "volume", "ior"))
 _TRANSPARENT = (TRANSMISSION, VOLUME, IOR)
 _IMAGES = ("EXT_texture_webp", "KHR_texture_basisu")
-READ_EXTENSIONS = (STRENGTH, SPECULAR, *_TRANSPARENT, VARIANTS, UNLIT, "KHR_texture_transform", *_IMAGES)
+READ_EXTENSIONS = (
+    STRENGTH,
+    SPECULAR,
+    *_TRANSPARENT,
+    VARIANTS,
+    UNLIT,
+    "KHR_texture_transform",
+    *_IMAGES,
+)
 """Extensions of materials and textures that are heeded."""
 
 _WRAPS: dict[int, Wrap] = {10497: "repeat", 33071: "clamp", 33648: "mirror"}
 
 
 class MaterialReader:
-    """Materials of a file, each read once, as its ``variant`` chooses them. Raises InputError for one that it does not
-    have."""
+    """Materials of a file, each read once, as its ``variant`` chooses them. Raises InputError for
+    one that it does not have."""
 
     def __init__(self, document: Document, variant: str | None = None) -> None:
         self.document, self.path = document, document.path
@@ -55,7 +63,9 @@ class MaterialReader:
                 self.note(f"shown without a variant; there are {_quote(names)} (--variant NAME)")
             return None
         if variant not in names:
-            raise InputError(f"{self.path}: has no variant '{variant}'; there are {_quote(names) or 'none'}")
+            raise InputError(
+                f"{self.path}: has no variant '{variant}'; there are {_quote(names) or 'none'}"
+            )
         return names.index(variant)
 
     def of(self, primitive: dict[str, Any]) -> int | None:
@@ -73,17 +83,22 @@ class MaterialReader:
 
     def apply_uv_transforms(self, meshes: list[Mesh], keep_layout: bool = False) -> list[Mesh]:
         """The meshes as their textures read them; see ``uv_unification.apply_all``."""
-        return uv_unification.apply_all(meshes, self._transforms, self.note, self._tiles, keep_layout)
+        return uv_unification.apply_all(
+            meshes, self._transforms, self.note, self._tiles, keep_layout
+        )
 
     def _place(self, index: int | None, tile: Tile | None = None) -> Material:
-        """A material, of one tile of its textures if it has some in tiles; where they read is remembered."""
+        """A material, of one tile of its textures if it has some in tiles; where they read is
+        remembered."""
         infos = self._texture_infos(index)
         self._tile = tile
         material = Material() if index is None else self._read_material(index)
         self._tile = None
         sets = self._sets(index)
         self._transforms[id(material)] = {
-            n: uv_transforms.UvTransform(uv_transforms.affine(_transform(info)), sets.index(_coordinates(info)))
+            n: uv_transforms.UvTransform(
+                uv_transforms.affine(_transform(info)), sets.index(_coordinates(info))
+            )
             for n, info in infos.items()
         }
         if tile is None and any(self._tiled_name(info) for info in infos.values()):
@@ -92,7 +107,9 @@ class MaterialReader:
 
     def _sets(self, index: int | None) -> list[int]:
         """Numbers of the sets of texture coordinates that the textures of a material read."""
-        return list(dict.fromkeys(_coordinates(i) for i in self._texture_infos(index).values())) or [0]
+        return list(
+            dict.fromkeys(_coordinates(i) for i in self._texture_infos(index).values())
+        ) or [0]
 
     def _tiled_name(self, info: dict[str, Any]) -> str | None:
         """The name of a texture in tiles, which glTF does not have, but some files."""
@@ -102,7 +119,9 @@ class MaterialReader:
 
     def _texture_infos(self, index: int | None) -> dict[str, dict[str, Any]]:
         """What a material says of its textures, by the name of ours."""
-        return {} if index is None else self._texture_infos_of(self.document.items("materials")[index])
+        return (
+            {} if index is None else self._texture_infos_of(self.document.items("materials")[index])
+        )
 
     def _texture_infos_of(self, m: dict[str, Any]) -> dict[str, dict[str, Any]]:
         extensions = m.get("extensions", {})
@@ -133,7 +152,9 @@ class MaterialReader:
         mode = _alpha_mode(m)
         material = self._transmissive(material, m.get("extensions", {}), name)
         if "occlusionTexture" in m:
-            material = self._occluded(material, m, name, mode != "opaque" or material.transmission > 0)
+            material = self._occluded(
+                material, m, name, mode != "opaque" or material.transmission > 0
+            )
         normal = m.get("normalTexture")
         emission, emission_texture = self._emission(m, name)
         return replace(
@@ -148,8 +169,11 @@ class MaterialReader:
         )
 
     def _unlit(self, m: dict[str, Any], name: str) -> Material:
-        """A material of which nothing but its base colour and alpha counts (KHR_materials_unlit)."""
-        pbr = {k: v for k, v in m.get("pbrMetallicRoughness", {}).items() if k.startswith("baseColor")}
+        """A material of which nothing but its base colour and alpha counts
+        (KHR_materials_unlit)."""
+        pbr = {
+            k: v for k, v in m.get("pbrMetallicRoughness", {}).items() if k.startswith("baseColor")
+        }
         return replace(
             self._metallic(pbr, name),
             metalness=0.0,
@@ -186,31 +210,46 @@ class MaterialReader:
         return replace(
             material,
             transmission=share,
-            transmission_texture=self._texture(extensions[TRANSMISSION].get("transmissionTexture"), "linear", name),
+            transmission_texture=self._texture(
+                extensions[TRANSMISSION].get("transmissionTexture"), "linear", name
+            ),
             ior=float(extensions.get(IOR, {}).get("ior", 1.5)),
             volume=volume,
             thickness_texture=thickness,
         )
 
     def _occluded(self, material: Material, m: dict[str, Any], name: str, kept: bool) -> Material:
-        """The material with its occlusion in the red channel, if it may pass into a result as it is (``kept``)."""
+        """The material with its occlusion in the red channel, if it may pass into a result as it is
+        (``kept``)."""
         if not kept:
             self.note("occlusion ignored (it is not part of the appearance under a moving light)")
             return material
-        info, orm = m["occlusionTexture"], m.get("pbrMetallicRoughness", {}).get("metallicRoughnessTexture")
+        info, orm = (
+            m["occlusionTexture"],
+            m.get("pbrMetallicRoughness", {}).get("metallicRoughnessTexture"),
+        )
         if orm is not None and info["index"] == orm["index"]:
             return replace(material, has_occlusion=True)
         others = self._texture_infos_of(m)
         if any(_place(info) != _place(other) for other in others.values()):
-            self.note(f"material '{name}': its occlusion lies elsewhere than its other textures: ignored")
+            self.note(
+                f"material '{name}': its occlusion lies elsewhere than its other textures: ignored"
+            )
             return material
         occlusion = self._texture(info, "linear", name)
         if occlusion is None:
             return material
-        return replace(material, orm_texture=with_occlusion(material.orm_texture, occlusion), has_occlusion=True)
+        return replace(
+            material,
+            orm_texture=with_occlusion(material.orm_texture, occlusion),
+            has_occlusion=True,
+        )
 
-    def _emission(self, m: dict[str, Any], name: str) -> tuple[tuple[float, float, float], Texture | None]:
-        """(factor, texture) of what a material emits: nothing if the texture that says where is missing."""
+    def _emission(
+        self, m: dict[str, Any], name: str
+    ) -> tuple[tuple[float, float, float], Texture | None]:
+        """(factor, texture) of what a material emits: nothing if the texture that says where is
+        missing."""
         strength = float(m.get("extensions", {}).get(STRENGTH, {}).get("emissiveStrength", 1.0))
         red, green, blue = (strength * float(x) for x in m.get("emissiveFactor", (0, 0, 0)))
         if not any((red, green, blue)):
@@ -225,7 +264,9 @@ class MaterialReader:
         self.note("specular-glossiness materials converted to metallic-roughness")
         infos = [given[k] for k in ("diffuseTexture", "specularGlossinessTexture") if k in given]
         if len({str((i.get("texCoord"), i.get("extensions"))) for i in infos}) > 1:
-            self.note(f"material '{name}': its textures differ in transform: the first one's is used for all")
+            self.note(
+                f"material '{name}': its textures differ in transform: the first one's is used for all"
+            )
         diffuse = [float(x) for x in given.get("diffuseFactor", (1, 1, 1, 1))]
         specular = [float(x) for x in given.get("specularFactor", (1, 1, 1))]
         read = specular_glossiness.Specular(
@@ -239,7 +280,9 @@ class MaterialReader:
             color, roughness, metalness = specular_glossiness.constants(read)
             return Material(name, color, roughness, metalness, opacity=diffuse[3])
         base, orm = specular_glossiness.textures(read)
-        return Material(name, (1, 1, 1), 1.0, 1.0, base_color_texture=base, orm_texture=orm, opacity=diffuse[3])
+        return Material(
+            name, (1, 1, 1), 1.0, 1.0, base_color_texture=base, orm_texture=orm, opacity=diffuse[3]
+        )
 
     def _texture(self, info: dict[str, Any] | None, space: str, material: str) -> Texture | None:
         if info is None:
@@ -249,15 +292,22 @@ class MaterialReader:
         name = self._tiled_name(info)
         if source is None:
             where = f"{self.path}: a texture of material '{material}'"
-            pixels = companions.read(partial(_refuse, f"{where} has no image in a supported format"))
+            pixels = companions.read(
+                partial(_refuse, f"{where} has no image in a supported format")
+            )
         elif name is not None:
             pixels = self._read_tile(name)
         else:
             if source not in self._images:
                 self._images[source] = companions.read(partial(self._image, source, material))
             pixels = self._images[source]
-        sampler = self.document.items("samplers")[texture["sampler"]] if "sampler" in texture else {}
-        wrap = (_WRAPS.get(sampler.get("wrapS", 0), "repeat"), _WRAPS.get(sampler.get("wrapT", 0), "repeat"))
+        sampler = (
+            self.document.items("samplers")[texture["sampler"]] if "sampler" in texture else {}
+        )
+        wrap = (
+            _WRAPS.get(sampler.get("wrapS", 0), "repeat"),
+            _WRAPS.get(sampler.get("wrapT", 0), "repeat"),
+        )
         if pixels is None:
             return None
         read = Texture(images.to_color(pixels), space, wrap)  # type: ignore[arg-type]
@@ -270,7 +320,11 @@ class MaterialReader:
         if self._tile is None:
             return None
         return udim.read_tile(
-            name, self._tile, self.path, companions, lambda file: companions.picture(companions.find(file, self.path))
+            name,
+            self._tile,
+            self.path,
+            companions,
+            lambda file: companions.picture(companions.find(file, self.path)),
         )
 
     def _image(self, index: int, material: str) -> NDArray:

@@ -1,5 +1,6 @@
-"""Buffer views that glTF holds compressed by meshoptimizer (EXT_meshopt_compression and its successor
-KHR_meshopt_compression: what ``gltfpack -c`` writes), through the optional package meshopt."""
+"""Buffer views that glTF holds compressed by meshoptimizer (EXT_meshopt_compression and its
+successor KHR_meshopt_compression: what ``gltfpack -c`` writes), through the optional package
+meshopt."""
 
 from __future__ import annotations
 
@@ -9,7 +10,8 @@ from appearance_opt.errors import InputError
 
 MESHOPT = ("EXT_meshopt_compression", "KHR_meshopt_compression")
 _MOST = 2048
-"""Bytes that one compressed byte can stand for, and some: what claims more is damaged, and must not ask for memory."""
+"""Bytes that one compressed byte can stand for, and some: what claims more is damaged, and must not
+ask for memory."""
 
 
 class PackageMissing(InputError):
@@ -23,8 +25,8 @@ def compressed(view: dict[str, Any]) -> dict[str, Any] | None:
 
 
 def decompress(data: bytes, view: dict[str, Any], where: str) -> bytes:
-    """The plain bytes behind ``data``, the compressed ones of a buffer view; ``view``: what ``compressed`` says of it.
-    ``where`` begins the errors. Raises InputError."""
+    """The plain bytes behind ``data``, the compressed ones of a buffer view; ``view``: what
+    ``compressed`` says of it. ``where`` begins the errors. Raises InputError."""
     try:
         import meshopt
     except ImportError:
@@ -34,8 +36,12 @@ def decompress(data: bytes, view: dict[str, Any], where: str) -> bytes:
         ) from None
     count, stride = view["count"], view["byteStride"]
     if count < 0 or count * stride > _MOST * len(data):
-        raise InputError(f"{where}: its meshopt data is damaged ({len(data)} bytes cannot hold {count} elements)")
+        raise InputError(
+            f"{where}: its meshopt data is damaged ({len(data)} bytes cannot hold {count} elements)"
+        )
     try:
-        return meshopt.decode_gltf_buffer(data, count, stride, view["mode"], view.get("filter", "NONE")).tobytes()
+        return meshopt.decode_gltf_buffer(
+            data, count, stride, view["mode"], view.get("filter", "NONE")
+        ).tobytes()
     except Exception as error:  # the decoder raises types of its own
         raise InputError(f"{where}: its meshopt data is damaged ({error})") from error

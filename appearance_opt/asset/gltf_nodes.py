@@ -1,4 +1,5 @@
-"""Where the nodes of a glTF file put their meshes: transforms, instances, and skins at their rest pose."""
+"""Where the nodes of a glTF file put their meshes: transforms, instances, and skins at their rest
+pose."""
 
 from __future__ import annotations
 
@@ -26,15 +27,19 @@ class Nodes:
     def __init__(self, document: Document) -> None:
         self.document, self.path = document, document.path
         self.nodes = document.items("nodes")
-        self._parents = {child: k for k, node in enumerate(self.nodes) for child in node.get("children", [])}
+        self._parents = {
+            child: k for k, node in enumerate(self.nodes) for child in node.get("children", [])
+        }
         self._joints: dict[int, NDArray[np.float64]] = {}
 
     @cached_property
     def local(self) -> NDArray[np.float64]:
-        """(N, 4, 4) transforms of the nodes relative to their parents: their matrices, or translation * rotation *
-        scale."""
+        """(N, 4, 4) transforms of the nodes relative to their parents: their matrices, or
+        translation * rotation * scale."""
         given = [[n.get(key, default) for n in self.nodes] for key, default in _TRANSFORM.items()]
-        out = compose(*(np.array(values, np.float64).reshape(len(self.nodes), -1) for values in given))
+        out = compose(
+            *(np.array(values, np.float64).reshape(len(self.nodes), -1) for values in given)
+        )
         for k, node in enumerate(self.nodes):
             if "matrix" in node:
                 out[k] = np.array(node["matrix"], np.float64).reshape(4, 4).T
@@ -45,8 +50,9 @@ class Nodes:
         return [k for k in range(len(self.nodes)) if k not in self._parents]
 
     def visits(self, roots: Iterable[int]) -> int:
-        """How many nodes a walk from ``roots`` meets. glTF asks for trees (2.0, 3.5.2); where nodes share children
-        all the same, a walk may be far longer than the file. Raises InputError if a node is its own ancestor."""
+        """How many nodes a walk from ``roots`` meets. glTF asks for trees (2.0, 3.5.2); where nodes
+        share children all the same, a walk may be far longer than the file. Raises InputError if a
+        node is its own ancestor."""
         below: dict[int, int | None] = {}
 
         def count(index: int) -> int:
@@ -55,7 +61,9 @@ class Nodes:
                 raise InputError(f"{self.path}: node {index} is its own ancestor")
             if not known:
                 below[index] = None
-                below[index] = known = 1 + sum(count(child) for child in self.nodes[index].get("children", []))
+                below[index] = known = 1 + sum(
+                    count(child) for child in self.nodes[index].get("children", [])
+                )
             return known
 
         return sum(count(root) for root in roots)
@@ -77,10 +85,16 @@ class Nodes:
         if INSTANCING not in node.get("extensions", {}):
             return Instances(world[None])
         accessors = node["extensions"][INSTANCING]["attributes"]
-        given = {key: self.document.accessor(accessors[key.upper()]) for key in _TRANSFORM if key.upper() in accessors}
+        given = {
+            key: self.document.accessor(accessors[key.upper()])
+            for key in _TRANSFORM
+            if key.upper() in accessors
+        }
         counts = {len(v) for v in given.values()}
         if len(counts) > 1:
-            raise InputError(f"{self.path}: the attributes of {INSTANCING} differ in length; export it again")
+            raise InputError(
+                f"{self.path}: the attributes of {INSTANCING} differ in length; export it again"
+            )
         count = counts.pop() if counts else 0
         each = (
             np.broadcast_to(given.get(key, np.array(default)), (count, len(default)))
@@ -88,14 +102,23 @@ class Nodes:
         )
         return Instances(world @ compose(*each))
 
-    def skinned(self, skin: int, attributes: dict[str, Any], read: Callable[[str], NDArray]) -> Instances:
-        """Where the vertices of a skinned primitive are at rest (glTF 2.0, 3.7.3): the sum of weight * world of the
-        joint * inverse bind matrix. The transform of the mesh's own node does not count. ``read``: an attribute."""
+    def skinned(
+        self, skin: int, attributes: dict[str, Any], read: Callable[[str], NDArray]
+    ) -> Instances:
+        """Where the vertices of a skinned primitive are at rest (glTF 2.0, 3.7.3): the sum of
+        weight * world of the joint * inverse bind matrix. The transform of the mesh's own node does
+        not count. ``read``: an attribute."""
         joints = self._rest(skin)
-        sets = [k for k in range(len(attributes)) if f"JOINTS_{k}" in attributes and f"WEIGHTS_{k}" in attributes]
+        sets = [
+            k
+            for k in range(len(attributes))
+            if f"JOINTS_{k}" in attributes and f"WEIGHTS_{k}" in attributes
+        ]
         index = np.concatenate([read(f"JOINTS_{k}") for k in sets], axis=1).astype(np.int64)
         weights = np.concatenate([read(f"WEIGHTS_{k}") for k in sets], axis=1).astype(np.float64)
-        weights[~np.any(weights, axis=1), 0] = 1.0  # a vertex without weights follows its first joint
+        weights[~np.any(weights, axis=1), 0] = (
+            1.0  # a vertex without weights follows its first joint
+        )
         weights /= weights.sum(axis=1, keepdims=True)
         blended = np.zeros((len(index), 4, 4))
         for k in range(index.shape[1]):
@@ -114,12 +137,17 @@ class Nodes:
         return self._joints[skin]
 
 
-_TRANSFORM = {"translation": (0.0, 0.0, 0.0), "rotation": (0.0, 0.0, 0.0, 1.0), "scale": (1.0, 1.0, 1.0)}
+_TRANSFORM = {
+    "translation": (0.0, 0.0, 0.0),
+    "rotation": (0.0, 0.0, 0.0, 1.0),
+    "scale": (1.0, 1.0, 1.0),
+}
 """What a node or an instance may say of its place, and what it means to leave it out."""
 
 
 def compose(translation: NDArray, rotation: NDArray, scale: NDArray) -> NDArray[np.float64]:
-    """(N, 4, 4) translation (N, 3) * rotation, unit quaternion (N, 4) as (x, y, z, w), * scale (N, 3)."""
+    """(N, 4, 4) translation (N, 3) * rotation, unit quaternion (N, 4) as (x, y, z, w), * scale (N,
+    3)."""
     x, y, z, w = np.asarray(rotation, np.float64).T
     out = np.zeros((len(x), 4, 4))
     turn = [

@@ -29,14 +29,22 @@ if TYPE_CHECKING:
     from appearance_opt.asset.companions import Companions
 
 _READ = {DRACO, *MESHOPT, INSTANCING, "KHR_mesh_quantization", *READ_EXTENSIONS}
-_VISUAL = ("KHR_materials_", "KHR_lights_", "EXT_lights_", "KHR_animation_pointer", "KHR_xmp_json_ld")
-"""Extensions, by the start of their names, without which shapes and textures are the same: lobes of materials, and
-lights. They are ignored with a note even where a file calls them required."""
+_VISUAL = (
+    "KHR_materials_",
+    "KHR_lights_",
+    "EXT_lights_",
+    "KHR_animation_pointer",
+    "KHR_xmp_json_ld",
+)
+"""Extensions, by the start of their names, without which shapes and textures are the same: lobes of
+materials, and lights. They are ignored with a note even where a file calls them required."""
 
 
-def load_gltf(path: Path, companions: Companions, keep_layout: bool = False, variant: str | None = None) -> Asset:
-    """Read a .gltf or .glb file. ``keep_layout``: see ``asset.load``; ``variant``: name of a KHR_materials_variants
-    variant. Raises InputError."""
+def load_gltf(
+    path: Path, companions: Companions, keep_layout: bool = False, variant: str | None = None
+) -> Asset:
+    """Read a .gltf or .glb file. ``keep_layout``: see ``asset.load``; ``variant``: name of a
+    KHR_materials_variants variant. Raises InputError."""
     document = Document(path, companions)
     for item in (*document.items("buffers"), *document.items("images")):
         uri = item.get("uri")
@@ -89,8 +97,8 @@ class _Reader:
         )
 
     def _roots(self) -> list[int]:
-        """The nodes at the top of what is drawn: those of the scene that the file names, else of the
-        first one; in a library without scenes, the nodes that are no one's children."""
+        """The nodes at the top of what is drawn: those of the scene that the file names, else of
+        the first one; in a library without scenes, the nodes that are no one's children."""
         scenes = self.document.items("scenes")
         if not scenes:
             return self.nodes.roots()
@@ -119,7 +127,9 @@ class _Reader:
             name = node.get("name") or mesh.get("name") or f"mesh{node['mesh']}"
             for k, primitive in enumerate(mesh["primitives"]):
                 weights = node.get("weights", mesh.get("weights", ()))
-                found = self._primitive(primitive, k, node, world, name if k == 0 else f"{name}.{k}", weights)
+                found = self._primitive(
+                    primitive, k, node, world, name if k == 0 else f"{name}.{k}", weights
+                )
                 meshes += [] if found is None else [found]
         for child in node.get("children", []):
             self._visit(child, world, meshes)
@@ -133,13 +143,15 @@ class _Reader:
         name: str,
         weights: Sequence[float],
     ) -> Mesh | None:
-        """The ``k``-th primitive of a node's mesh, at every place at which the node puts it; None if it is none of
-        triangles. ``weights``: of its morph targets."""
+        """The ``k``-th primitive of a node's mesh, at every place at which the node puts it; None
+        if it is none of triangles. ``weights``: of its morph targets."""
         if primitive.get("mode", 4) not in (4, 5, 6):
             self.note("points and lines ignored")
             return None
         if primitive.get("targets"):
-            self.note("morph targets: the shape of their default weights is kept, others are dropped")
+            self.note(
+                "morph targets: the shape of their default weights is kept, others are dropped"
+            )
         if "skin" in node and "JOINTS_0" in primitive["attributes"]:
             source = _Source(self.document, primitive, weights)
             place = self.nodes.skinned(node["skin"], primitive["attributes"], source.read)
@@ -153,8 +165,14 @@ class _Reader:
                 self._local[key] = local
         place = self.nodes.placement(node, world)
         inside = local.material.volume
-        if inside is not None and inside.thickness > 0 and not np.allclose(place.volumes(), 1, rtol=1e-3):
-            self.note("the thickness of transmissive materials is not scaled with the nodes of their meshes")
+        if (
+            inside is not None
+            and inside.thickness > 0
+            and not np.allclose(place.volumes(), 1, rtol=1e-3)
+        ):
+            self.note(
+                "the thickness of transmissive materials is not scaled with the nodes of their meshes"
+            )
         self.document.companions.budget.take_copies(local, place.copies, self.path)
         return place_copies(local, place, name)
 
@@ -171,7 +189,9 @@ class _Reader:
             if material.alpha_mode == "opaque":  # their alpha means nothing
                 colors = colors[:, :3]
         names = [f"TEXCOORD_{k}" for k in sets]
-        uvs = uv_transforms.stack_sets([_float(read(n)[:, :2]) if n in attributes else None for n in names])
+        uvs = uv_transforms.stack_sets(
+            [_float(read(n)[:, :2]) if n in attributes else None for n in names]
+        )
         positions = read("POSITION")[:, :3].astype(np.float64)
         return Mesh(positions, source.faces, normals, uvs, tangents, colors, material)  # type: ignore[arg-type]
 
@@ -189,21 +209,31 @@ class _Reader:
 
 
 class _Source:
-    """The triangles of a primitive, ``faces`` (F, 3), and its attributes. Of accessors that it has ``shared`` with
-    other primitives it takes the vertices that it uses. ``weights``: of its morph targets."""
+    """The triangles of a primitive, ``faces`` (F, 3), and its attributes. Of accessors that it has
+    ``shared`` with other primitives it takes the vertices that it uses. ``weights``: of its morph
+    targets."""
 
     def __init__(
-        self, document: Document, primitive: dict[str, Any], weights: Sequence[float], shared: bool = False
+        self,
+        document: Document,
+        primitive: dict[str, Any],
+        weights: Sequence[float],
+        shared: bool = False,
     ) -> None:
         self.document, self.path, self.attributes = document, document.path, primitive["attributes"]
         # (weight, accessors) of the morph targets that count
-        self.targets = [(w, t) for w, t in zip(weights, primitive.get("targets", ()), strict=False) if w]
+        self.targets = [
+            (w, t) for w, t in zip(weights, primitive.get("targets", ()), strict=False) if w
+        ]
         self.compressed = Compressed.of(document, primitive)
         self._used: NDArray | None = None
         if self.compressed is not None:
             self.faces = self.compressed.faces
             return
-        accessor, count = primitive.get("indices"), len(document.accessor(self.attributes["POSITION"]))
+        accessor, count = (
+            primitive.get("indices"),
+            len(document.accessor(self.attributes["POSITION"])),
+        )
         indices = np.arange(count) if accessor is None else document.accessor(accessor)[:, 0]
         self.faces = _triangles(indices.astype(np.int64), primitive.get("mode", 4))
         if shared and len(self.faces) and self.faces.max() < count:
@@ -221,8 +251,8 @@ class _Source:
         return values if self._used is None else values[self._used]
 
     def _morphed(self, values: NDArray, displacements: list[tuple[float, int]]) -> NDArray:
-        """(V, width) values of an attribute plus the sum of weight * displacement, accessors of which
-        are given (glTF 2.0, 3.7.2.2); those of tangents have no handedness."""
+        """(V, width) values of an attribute plus the sum of weight * displacement, accessors of
+        which are given (glTF 2.0, 3.7.2.2); those of tangents have no handedness."""
         if not displacements:
             return values
         out = values.astype(np.float64)
@@ -236,10 +266,13 @@ class _Source:
         return out
 
 
-def flat_normals(positions: NDArray, faces: NDArray) -> tuple[NDArray[np.intp], NDArray[np.int64], NDArray[np.float32]]:
-    """(vertex that each new vertex comes from, faces, normals) with the faces' normals: "When normals are not
-    specified, client implementations MUST calculate flat normals and the provided tangents (if present) MUST be
-    ignored" (glTF 2.0, 3.7.2.1). Where faces of different normals meet, each corner gets a vertex of its own."""
+def flat_normals(
+    positions: NDArray, faces: NDArray
+) -> tuple[NDArray[np.intp], NDArray[np.int64], NDArray[np.float32]]:
+    """(vertex that each new vertex comes from, faces, normals) with the faces' normals: "When
+    normals are not specified, client implementations MUST calculate flat normals and the provided
+    tangents (if present) MUST be ignored" (glTF 2.0, 3.7.2.1). Where faces of different normals
+    meet, each corner gets a vertex of its own."""
     corners = faces.ravel()
     p = positions[faces].astype(np.float64)
     with np.errstate(all="ignore"):

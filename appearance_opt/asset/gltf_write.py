@@ -29,8 +29,8 @@ _ARRAY_BUFFER, _ELEMENT_BUFFER = 34962, 34963
 def save_gltf(asset: Asset, path: Path) -> None:
     """Write .glb (one file) or .gltf (geometry in ``<stem>.bin``, textures in ``<stem>_<k>.png``).
 
-    glTF has no displacement: a height map goes to ``<stem>_displacement.png`` (16 bit), and the extras of
-    its materials name it, its scale and its mid-level.
+    glTF has no displacement: a height map goes to ``<stem>_displacement.png`` (16 bit), and the
+    extras of its materials name it, its scale and its mid-level.
     """
     path = Path(path)
     writer = _Writer(asset, path.stem)
@@ -74,12 +74,16 @@ class _Writer:
                 materials[id(mesh.material)] = len(materials)
                 written = self._material(mesh.material)
                 if (look := apart_from_sides(mesh.material)) in looks:
-                    written["name"] += "_double_sided" if mesh.material.double_sided else "_single_sided"
+                    written["name"] += (
+                        "_double_sided" if mesh.material.double_sided else "_single_sided"
+                    )
                 looks.add(look)
                 self.json.setdefault("materials", []).append(written)
             self.json["meshes"].append(self._mesh(mesh, materials[id(mesh.material)]))
         with ThreadPoolExecutor() as pool:
-            self.image_files = list(pool.map(lambda p: images.encode_png(encoded_for(*p)), self._pending))
+            self.image_files = list(
+                pool.map(lambda p: images.encode_png(encoded_for(*p)), self._pending)
+            )
         if self._pending:
             self.json["images"] = [{} for _ in self._pending]
             self.json["samplers"] = self._samplers
@@ -97,7 +101,13 @@ class _Writer:
         binary = bytes(self.binary) + b"\0" * (-len(self.binary) % 4)
         head = struct.pack("<4sII", b"glTF", 2, 12 + 8 + len(text) + 8 + len(binary))
         return b"".join(
-            [head, struct.pack("<I4s", len(text), b"JSON"), text, struct.pack("<I4s", len(binary), b"BIN\0"), binary]
+            [
+                head,
+                struct.pack("<I4s", len(text), b"JSON"),
+                text,
+                struct.pack("<I4s", len(binary), b"BIN\0"),
+                binary,
+            ]
         )
 
     def _view(self, data: bytes, target: int | None = None) -> int:
@@ -118,7 +128,10 @@ class _Writer:
             "type": f"VEC{values.shape[1]}",
         }
         if bounds:
-            accessor["min"], accessor["max"] = values.min(axis=0).tolist(), values.max(axis=0).tolist()
+            accessor["min"], accessor["max"] = (
+                values.min(axis=0).tolist(),
+                values.max(axis=0).tolist(),
+            )
         self.json["accessors"].append(accessor)
         return len(self.json["accessors"]) - 1
 
@@ -127,7 +140,9 @@ class _Writer:
         if mesh.normals is not None:
             attributes["NORMAL"] = self._attribute(_unit(mesh.normals))
             if mesh.tangents is not None:
-                tangents = np.concatenate([_unit(mesh.tangents[:, :3]), mesh.tangents[:, 3:]], axis=1)
+                tangents = np.concatenate(
+                    [_unit(mesh.tangents[:, :3]), mesh.tangents[:, 3:]], axis=1
+                )
                 attributes["TANGENT"] = self._attribute(tangents)
         if mesh.uvs is not None:
             attributes["TEXCOORD_0"] = self._attribute(mesh.uvs)
@@ -136,9 +151,18 @@ class _Writer:
         # the largest index of a type is reserved (primitive restart)
         kind, code = (np.uint16, 5123) if len(mesh.positions) < 65535 else (np.uint32, 5125)
         view = self._view(np.ascontiguousarray(mesh.faces, kind).tobytes(), _ELEMENT_BUFFER)
-        indices = {"bufferView": view, "componentType": code, "count": 3 * len(mesh.faces), "type": "SCALAR"}
+        indices = {
+            "bufferView": view,
+            "componentType": code,
+            "count": 3 * len(mesh.faces),
+            "type": "SCALAR",
+        }
         self.json["accessors"].append(indices)
-        primitive = {"attributes": attributes, "indices": len(self.json["accessors"]) - 1, "material": material}
+        primitive = {
+            "attributes": attributes,
+            "indices": len(self.json["accessors"]) - 1,
+            "material": material,
+        }
         return {"name": mesh.name, "primitives": [primitive]}
 
     def _material(self, m: Material) -> dict[str, Any]:
@@ -149,15 +173,24 @@ class _Writer:
         }
         if m.base_color_texture is not None:
             pbr["baseColorTexture"] = {"index": self._texture(m.base_color_texture, "srgb")}
-        if m.unlit:  # what readers without the extension show comes near (KHR_materials_unlit, "Fallback")
+        if (
+            m.unlit
+        ):  # what readers without the extension show comes near (KHR_materials_unlit, "Fallback")
             pbr |= {"roughnessFactor": 0.9, "metallicFactor": 0.0}
         elif m.orm_texture is not None:
             pbr["metallicRoughnessTexture"] = {"index": self._texture(m.orm_texture)}
-        out: dict[str, Any] = {"name": m.name, "pbrMetallicRoughness": pbr, "doubleSided": m.double_sided}
+        out: dict[str, Any] = {
+            "name": m.name,
+            "pbrMetallicRoughness": pbr,
+            "doubleSided": m.double_sided,
+        }
         if m.unlit:
             self._extend(out, UNLIT, {})
         elif m.normal_texture is not None:
-            out["normalTexture"] = {"index": self._texture(m.normal_texture), "scale": m.normal_scale}
+            out["normalTexture"] = {
+                "index": self._texture(m.normal_texture),
+                "scale": m.normal_scale,
+            }
         if m.orm_texture is not None and m.has_occlusion and not m.unlit:
             out["occlusionTexture"] = {"index": self._texture(m.orm_texture)}
         if m.emits and not m.unlit:

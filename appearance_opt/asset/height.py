@@ -14,8 +14,8 @@ if TYPE_CHECKING:
 
 
 def displacement_of(heights: NDArray[np.float32]) -> Displacement:
-    """(H, W) heights in metres as 16 bits: mid-level 0.5 is no displacement, and the scale is the least
-    that holds all of them. The rounding error is at most scale / 131070."""
+    """(H, W) heights in metres as 16 bits: mid-level 0.5 is no displacement, and the scale is the
+    least that holds all of them. The rounding error is at most scale / 131070."""
     scale = 2 * float(np.abs(heights).max(initial=0.0))
     scale = scale if scale > 0 else 1.0
     # the mid-level is a stored value, so that no displacement stays exactly none
@@ -27,7 +27,11 @@ def displacement_of(heights: NDArray[np.float32]) -> Displacement:
 
 def as_16_bit(displacement: Displacement) -> Displacement:
     """The same, its texels as uint16."""
-    return displacement if displacement.texture.pixels.dtype == np.uint16 else displacement_of(heights_of(displacement))
+    return (
+        displacement
+        if displacement.texture.pixels.dtype == np.uint16
+        else displacement_of(heights_of(displacement))
+    )
 
 
 def heights_of(displacement: Displacement) -> NDArray[np.float32]:
@@ -38,7 +42,8 @@ def heights_of(displacement: Displacement) -> NDArray[np.float32]:
 
 
 def height_png(displacement: Displacement) -> bytes:
-    """16-bit PNG with ``DisplacementScale`` (metres) and ``DisplacementMidLevel`` as text chunks."""
+    """16-bit PNG with ``DisplacementScale`` (metres) and ``DisplacementMidLevel`` as text
+    chunks."""
     d = as_16_bit(displacement)
     return images.encode_png(d.texture.pixels[..., :1], _attributes(d.scale, d.mid))
 

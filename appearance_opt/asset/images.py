@@ -27,14 +27,16 @@ MAX_SIZE = 16384
 
 
 def decode(data: bytes, name: str, budget: Budget | None = None) -> NDArray:
-    """Pixels (H, W, C) of an image file in memory; uint8, uint16 or float32 as stored, row 0 on top. ``budget``: what
-    they may take. Raises InputError when it cannot be read, or is too large."""
+    """Pixels (H, W, C) of an image file in memory; uint8, uint16 or float32 as stored, row 0 on
+    top. ``budget``: what they may take. Raises InputError when it cannot be read, or is too
+    large."""
     if not data:
         raise InputError(f"{name}: the image is empty")
     if basis.is_basis(data):
         return basis.decode(data, name, MAX_SIZE, budget)
-    # the Python bindings of OpenImageIO read from and write to named files only, and the name chooses the reader:
-    # one of ours, by what the data is, for a name may ask for readers that read no picture at all
+    # the Python bindings of OpenImageIO read from and write to named files only, and the name
+    # chooses the reader: one of ours, by what the data is, for a name may ask for readers that read
+    # no picture at all
     suffix = _suffix(data, name)
     if suffix == ".png":
         check_png(data, name)
@@ -52,7 +54,8 @@ def read(path: Path) -> NDArray:
 
 
 def to_color(pixels: NDArray) -> NDArray:
-    """Pixels of at least three channels: grey ones repeat theirs, and keep their alpha if they have one."""
+    """Pixels of at least three channels: grey ones repeat theirs, and keep their alpha if they have
+    one."""
     if pixels.shape[2] >= 3:
         return pixels
     grey = np.repeat(pixels[..., :1], 3, axis=2)
@@ -60,7 +63,8 @@ def to_color(pixels: NDArray) -> NDArray:
 
 
 def check_png(data: bytes, name: str) -> None:
-    """Raise InputError if a PNG file is cut short or a chunk's checksum is wrong (PNG specification, 5.3).
+    """Raise InputError if a PNG file is cut short or a chunk's checksum is wrong (PNG
+    specification, 5.3).
 
     libpng, asked to read such a file, prints to standard error before it fails.
     """
@@ -107,7 +111,9 @@ def _open(path: Path, name: str, budget: Budget | None) -> NDArray:
     config.attribute("oiio:UnassociatedAlpha", 1)
     source = oiio.ImageInput.open(str(path), config)
     if source is None:
-        raise InputError(f"{name}: not a readable image ({_reason(oiio.geterror, 'unknown format')})")
+        raise InputError(
+            f"{name}: not a readable image ({_reason(oiio.geterror, 'unknown format')})"
+        )
     try:
         return _read(source, name, budget)
     finally:
@@ -119,7 +125,9 @@ def _read(source, name: str, budget: Budget | None) -> NDArray:
 
     spec = source.spec()
     if spec.width > MAX_SIZE or spec.height > MAX_SIZE:
-        raise InputError(f"{name}: {spec.width} x {spec.height} pixels; at most {MAX_SIZE} x {MAX_SIZE} are supported")
+        raise InputError(
+            f"{name}: {spec.width} x {spec.height} pixels; at most {MAX_SIZE} x {MAX_SIZE} are supported"
+        )
     kind = {oiio.UINT8: oiio.UINT8, oiio.UINT16: oiio.UINT16}.get(spec.format.basetype, oiio.FLOAT)
     channels = min(spec.nchannels, 4)
     if budget is not None:
@@ -127,7 +135,9 @@ def _read(source, name: str, budget: Budget | None) -> NDArray:
         budget.take_picture(spec.width, spec.height, channels * size, name)
     pixels = source.read_image(0, 0, 0, channels, kind)
     if pixels is None:
-        raise InputError(f"{name}: the image is damaged ({_reason(source.geterror, 'cannot be decoded')})")
+        raise InputError(
+            f"{name}: the image is damaged ({_reason(source.geterror, 'cannot be decoded')})"
+        )
     pixels = pixels.reshape(spec.height, spec.width, channels)
     if pixels.dtype == np.float32 and not np.isfinite(pixels).all():
         raise InputError(f"{name}: the image has NaN or infinite pixels")
@@ -135,19 +145,22 @@ def _read(source, name: str, budget: Budget | None) -> NDArray:
 
 
 def encode_png(pixels: NDArray, attributes: Mapping[str, float | str] | None = None) -> bytes:
-    """PNG file of (H, W, C) uint8 or uint16 pixels, ``attributes`` as text chunks. Fast compression: a
-    texture is written more often than it is shipped."""
+    """PNG file of (H, W, C) uint8 or uint16 pixels, ``attributes`` as text chunks. Fast
+    compression: a texture is written more often than it is shipped."""
     import OpenImageIO as oiio
 
     height, width, channels = pixels.shape
-    spec = oiio.ImageSpec(width, height, channels, oiio.UINT16 if pixels.dtype == np.uint16 else oiio.UINT8)
+    spec = oiio.ImageSpec(
+        width, height, channels, oiio.UINT16 if pixels.dtype == np.uint16 else oiio.UINT8
+    )
     spec.attribute("png:compressionLevel", 3)
     spec.attribute("oiio:UnassociatedAlpha", 1)
     return _encode(np.ascontiguousarray(pixels), spec, ".png", attributes)
 
 
 def encode_exr(pixels: NDArray, attributes: Mapping[str, float | str] | None = None) -> bytes:
-    """OpenEXR file (32-bit float, lossless zip) of (H, W, C) linear pixels, with header attributes."""
+    """OpenEXR file (32-bit float, lossless zip) of (H, W, C) linear pixels, with header
+    attributes."""
     import OpenImageIO as oiio
 
     height, width, channels = pixels.shape
@@ -156,19 +169,27 @@ def encode_exr(pixels: NDArray, attributes: Mapping[str, float | str] | None = N
     return _encode(np.ascontiguousarray(pixels, np.float32), spec, ".exr", attributes)
 
 
-def _encode(pixels: NDArray, spec, suffix: str, attributes: Mapping[str, float | str] | None) -> bytes:
+def _encode(
+    pixels: NDArray, spec, suffix: str, attributes: Mapping[str, float | str] | None
+) -> bytes:
     import OpenImageIO as oiio
 
     for name, value in (attributes or {}).items():
         # PNG keeps text alone
-        spec.attribute(name, f"{value:.9g}" if suffix == ".png" and not isinstance(value, str) else value)
+        spec.attribute(
+            name, f"{value:.9g}" if suffix == ".png" and not isinstance(value, str) else value
+        )
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / ("image" + suffix)
         out = oiio.ImageOutput.create(str(path))
         if out is None or not out.open(str(path), spec) or not out.write_image(pixels):
-            raise OSError(f"a {suffix} image could not be encoded in {folder} ({one_line(oiio.geterror())})")
+            raise OSError(
+                f"a {suffix} image could not be encoded in {folder} ({one_line(oiio.geterror())})"
+            )
         if not out.close():  # what is buffered meets a full disk only now
-            raise OSError(f"a {suffix} image could not be encoded in {folder} ({one_line(out.geterror())})")
+            raise OSError(
+                f"a {suffix} image could not be encoded in {folder} ({one_line(out.geterror())})"
+            )
         return path.read_bytes()
 
 
@@ -187,17 +208,24 @@ def _suffix(data: bytes, name: str) -> str:
     for head, suffix in magic:
         if data.startswith(head):
             return suffix
-    if len(data) > 18 and data[1] <= 1 and data[2] in _TGA_TYPES and data[16] in (8, 15, 16, 24, 32):
+    if (
+        len(data) > 18
+        and data[1] <= 1
+        and data[2] in _TGA_TYPES
+        and data[16] in (8, 15, 16, 24, 32)
+    ):
         return ".tga"  # it has no magic number
-    raise InputError(f"{name}: not a readable image (neither PNG, JPEG, EXR, TIFF, WebP, BMP, TGA, HDR nor KTX2)")
+    raise InputError(
+        f"{name}: not a readable image (neither PNG, JPEG, EXR, TIFF, WebP, BMP, TGA, HDR nor KTX2)"
+    )
 
 
 _TGA_TYPES = (1, 2, 3, 9, 10, 11)
 
 
 def _reason(said: Callable[[], str], otherwise: str) -> str:
-    """What OpenImageIO says of a fault, on one line; ``otherwise`` if it says nothing, or bytes that are no text: it
-    quotes what stands in the file."""
+    """What OpenImageIO says of a fault, on one line; ``otherwise`` if it says nothing, or bytes
+    that are no text: it quotes what stands in the file."""
     try:
         return " ".join(said().split()) or otherwise
     except UnicodeDecodeError:

@@ -13,8 +13,9 @@ from appearance_opt.asset.types import Mesh
 
 @dataclass(frozen=True)
 class Instances:
-    """Affine maps from a mesh to the world: ``matrix`` is (P, 4, 4), the places of P copies, or, if it is ``skinned``,
-    (V, 4, 4) with one for each vertex of a single copy. The copies lie one after the other in what is returned."""
+    """Affine maps from a mesh to the world: ``matrix`` is (P, 4, 4), the places of P copies, or, if
+    it is ``skinned``, (V, 4, 4) with one for each vertex of a single copy. The copies lie one after
+    the other in what is returned."""
 
     matrix: NDArray[np.float64]
     skinned: bool = False
@@ -34,7 +35,11 @@ class Instances:
 
     def repeated(self, values: NDArray | None) -> NDArray | None:
         """(P V, width) what all copies have alike."""
-        return values if values is None or self.skinned or len(self.matrix) == 1 else np.tile(values, (self.copies, 1))
+        return (
+            values
+            if values is None or self.skinned or len(self.matrix) == 1
+            else np.tile(values, (self.copies, 1))
+        )
 
     def volumes(self) -> NDArray[np.float64]:
         """How many times as large as in its own coordinates anything is at each place."""
@@ -49,7 +54,10 @@ class Instances:
         if self.skinned:
             turned = self._mirrors[faces[:, 0]][:, None]
             return np.where(turned, faces[:, ::-1], faces).astype(np.int32)
-        out = np.repeat(faces[None], self.copies, axis=0) + (np.arange(self.copies) * vertices)[:, None, None]
+        out = (
+            np.repeat(faces[None], self.copies, axis=0)
+            + (np.arange(self.copies) * vertices)[:, None, None]
+        )
         if self._mirrors.any():
             out[self._mirrors] = out[self._mirrors][..., ::-1]
         return out.reshape(-1, 3).astype(np.int32)
@@ -63,7 +71,9 @@ class Instances:
     def _mirrors(self) -> NDArray[np.bool_]:
         return np.linalg.det(self.matrix[:, :3, :3]) < 0
 
-    def _mapped(self, linear: NDArray, v: NDArray, offset: NDArray | None = None) -> NDArray[np.float64]:
+    def _mapped(
+        self, linear: NDArray, v: NDArray, offset: NDArray | None = None
+    ) -> NDArray[np.float64]:
         if self.skinned:
             out = np.einsum("vij,vj->vi", linear, v)
             return out if offset is None else out + offset
@@ -75,8 +85,8 @@ _NEXT, _AFTER = np.array([1, 2, 0]), np.array([2, 0, 1])
 
 
 def _cofactors(m: NDArray) -> NDArray[np.float64]:
-    """(N, 3, 3) of the linear parts: they transform normals, of singular matrices too (inverse transpose times
-    determinant)."""
+    """(N, 3, 3) of the linear parts: they transform normals, of singular matrices too (inverse
+    transpose times determinant)."""
     i, j, k, n = _NEXT[:, None], _NEXT, _AFTER[:, None], _AFTER
     return m[:, i, j] * m[:, k, n] - m[:, i, n] * m[:, k, j]
 

@@ -1,6 +1,7 @@
 """Surfaces of MaterialX networks as metallic-roughness materials.
 
-An input that depends on nodes that are not read (``materialx_nodes``) keeps its default, with a note that names them.
+An input that depends on nodes that are not read (``materialx_nodes``) keeps its default, with a
+note that names them.
 """
 
 from __future__ import annotations
@@ -10,7 +11,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from appearance_opt.asset.materialx_nodes import Missing, NotUnderstood, Value, combine, evaluate, normal_map
+from appearance_opt.asset.materialx_nodes import (
+    Missing,
+    NotUnderstood,
+    Value,
+    combine,
+    evaluate,
+    normal_map,
+)
 from appearance_opt.asset.packing import pack_orm, with_alpha
 from appearance_opt.asset.types import Material
 
@@ -26,8 +34,8 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Surface:
-    """Names and defaults of what a surface shader says of metallic-roughness; "" for what it does not have.
-    ``ignored``: weights of lobes that are not drawn."""
+    """Names and defaults of what a surface shader says of metallic-roughness; "" for what it does
+    not have. ``ignored``: weights of lobes that are not drawn."""
 
     color: tuple[str, float]
     roughness: tuple[str, float]
@@ -69,18 +77,24 @@ SURFACES = {
 """Defaults are those of the node definitions that come with MaterialX."""
 
 
-def read_surface(surface: Node, name: str, note: Callable[[str], None]) -> tuple[Material, Mapping[str, Place]] | None:
-    """(the material of a surface shader, where each of its textures reads, by field name); None, with a note, if the
-    shader is none of ``SURFACES``. Raises what reading its pictures raises."""
+def read_surface(
+    surface: Node, name: str, note: Callable[[str], None]
+) -> tuple[Material, Mapping[str, Place]] | None:
+    """(the material of a surface shader, where each of its textures reads, by field name); None,
+    with a note, if the shader is none of ``SURFACES``. Raises what reading its pictures raises."""
     shader = SURFACES.get(surface.category)
     if shader is None:
-        note(f"material '{name}': the MaterialX surface '{surface.category}' is not understood: a default one is used")
+        note(
+            f"material '{name}': the MaterialX surface '{surface.category}' is not understood: a default one is used"
+        )
         return None
     return _SurfaceReader(surface, shader, name, note).material()
 
 
 class _SurfaceReader:
-    def __init__(self, surface: Node, shader: Surface, name: str, note: Callable[[str], None]) -> None:
+    def __init__(
+        self, surface: Node, shader: Surface, name: str, note: Callable[[str], None]
+    ) -> None:
         self.surface, self.shader, self.name = surface, shader, name
         self.note = lambda text: note(f"material '{name}': {text}")
 
@@ -101,12 +115,16 @@ class _SurfaceReader:
         if rough.texture or metal.texture:
             orm = pack_orm(rough.texture, metal.texture)
             if rough.texture and metal.texture and not rough.place.equals(metal.place):
-                self.note("roughness and metalness differ in transform: the first one's is used for both")
+                self.note(
+                    "roughness and metalness differ in transform: the first one's is used for both"
+                )
         color = base.texture
         mode, cutoff = self._alpha_mode(opacity)
         if opacity.texture is not None and mode != "opaque":
             if color is not None and not base.place.equals(opacity.place):
-                self.note("colour and opacity differ in transform: the first one's is used for both")
+                self.note(
+                    "colour and opacity differ in transform: the first one's is used for both"
+                )
             places["base_color_texture"] = base if color is not None else opacity
             color = with_alpha(color, opacity.texture)
         self._note_what_is_ignored()
@@ -126,14 +144,18 @@ class _SurfaceReader:
             emission_texture=glow.texture if glow.factor.any() else None,
             transmission=self._transmission(),
         )
-        return material, {n: v.place for n, v in places.items() if v is not None and v.texture is not None}
+        return material, {
+            n: v.place for n, v in places.items() if v is not None and v.texture is not None
+        }
 
     def _weighted(self, color: tuple[str, float], weight: tuple[str, float]) -> Value:
         """A colour times its weight."""
         values = [self._value(*weight, 1), self._value(*color, 3)]
         if values[0].texture is None and not values[0].factor.any():
             return Value(np.zeros(3, np.float32))
-        return self._or_default(color[0], values[1], lambda: combine(np.multiply, values, True).adapted(3))
+        return self._or_default(
+            color[0], values[1], lambda: combine(np.multiply, values, True).adapted(3)
+        )
 
     def _value(self, name: str, default: float, width: int) -> Value:
         given = self.surface.input(name) if name else None
@@ -146,7 +168,9 @@ class _SurfaceReader:
         try:
             return get()
         except NotUnderstood as error:
-            self.note(f"{name}: {error}: {', '.join(f'{x:g}' for x in default.factor)} stands for it")
+            self.note(
+                f"{name}: {error}: {', '.join(f'{x:g}' for x in default.factor)} stands for it"
+            )
         except Missing:
             pass
         return default
@@ -167,7 +191,10 @@ class _SurfaceReader:
 
     def _alpha_mode(self, opacity: Value) -> tuple[AlphaMode, float]:
         if self.surface.category == "gltf_pbr":
-            mode, cutoff = (self._value(n, d, 1).factor[0] for n, d in (("alpha_mode", 0.0), ("alpha_cutoff", 0.5)))
+            mode, cutoff = (
+                self._value(n, d, 1).factor[0]
+                for n, d in (("alpha_mode", 0.0), ("alpha_cutoff", 0.5))
+            )
             return ("opaque", "mask", "blend")[int(np.clip(mode, 0, 2))], float(cutoff)  # type: ignore[return-value]
         threshold = 0.0
         if self.surface.category == "UsdPreviewSurface":
@@ -179,7 +206,9 @@ class _SurfaceReader:
     def _transmission(self) -> float:
         share = self._value(self.shader.transmission, 0.0, 1)
         if share.texture is not None:
-            self.note(f"the picture of {self.shader.transmission} is ignored: its factor alone counts")
+            self.note(
+                f"the picture of {self.shader.transmission} is ignored: its factor alone counts"
+            )
         return float(share.factor[0])
 
     def _note_what_is_ignored(self) -> None:

@@ -32,7 +32,16 @@ _METRES = {
 MAX_INCLUDES = 16
 """Documents that include each other, in a row."""
 
-WIDTHS = {"float": 1, "integer": 1, "boolean": 1, "vector2": 2, "vector3": 3, "color3": 3, "vector4": 4, "color4": 4}
+WIDTHS = {
+    "float": 1,
+    "integer": 1,
+    "boolean": 1,
+    "vector2": 2,
+    "vector3": 3,
+    "color3": 3,
+    "vector4": 4,
+    "color4": 4,
+}
 _ENCODED = ("srgb_texture", "srgb_displayp3", "g22_rec709", "gamma22")
 """Colour spaces that are decoded as sRGB is; all others count as linear."""
 
@@ -44,8 +53,8 @@ def find_surface(
     read: Callable[[str], NDArray | None],
     fitted: Callable[[Texture, str], Texture],
 ) -> DocumentNode | None:
-    """The surface shader of the material ``name`` of a .mtlx file; None if it is not there. ``read``: pixels of a file
-    that it names; ``fitted``: see ``Node``. Raises InputError."""
+    """The surface shader of the material ``name`` of a .mtlx file; None if it is not there.
+    ``read``: pixels of a file that it names; ``fitted``: see ``Node``. Raises InputError."""
     document = _read(path, companions)
     material = document.getNode(name)
     if material is None or material.getType() != "material":
@@ -63,18 +72,28 @@ def _read(path: Path, companions: Companions) -> Any:
             raise InputError(f"{path}: its documents include each other in circles")
         found = companions.find(file.asString(), path)
         options.readXIncludeFunction = partial(include, depth=depth + 1)
-        mx.readFromXmlString(into, without_stray_bytes(read_text(found)), mx.FileSearchPath(str(found.parent)), options)
+        mx.readFromXmlString(
+            into,
+            without_stray_bytes(read_text(found)),
+            mx.FileSearchPath(str(found.parent)),
+            options,
+        )
 
     document = mx.createDocument()
     options = mx.XmlReadOptions()
     options.readXIncludeFunction = partial(include, depth=1)
     try:
         mx.readFromXmlString(
-            document, without_stray_bytes(read_text(path)), mx.FileSearchPath(str(path.parent)), options
+            document,
+            without_stray_bytes(read_text(path)),
+            mx.FileSearchPath(str(path.parent)),
+            options,
         )
         document.flattenSubgraphs()  # nodes that the document itself makes of others
     except (mx.Exception, mx.ExceptionParseError, RuntimeError) as error:
-        raise InputError(f"{path}: not a readable MaterialX file ({' '.join(str(error).split())[:160]})") from None
+        raise InputError(
+            f"{path}: not a readable MaterialX file ({' '.join(str(error).split())[:160]})"
+        ) from None
     for element in document.traverseTree():
         if isinstance(element, mx.Input) and element.getType() == "filename":
             companions.mention(element.getResolvedValueString(), path)
@@ -83,7 +102,8 @@ def _read(path: Path, companions: Companions) -> Any:
 
 @dataclass(frozen=True)
 class _Context:
-    """What the nodes of a document share: itself, for it ends with its last owner, and what reads its pictures."""
+    """What the nodes of a document share: itself, for it ends with its last owner, and what reads
+    its pictures."""
 
     document: Any
     read: Callable[[str], NDArray | None]
@@ -98,12 +118,17 @@ class DocumentNode:
         self.name: str = node.getName()
         self.category: str = node.getCategory()
         self.width = WIDTHS.get(node.getType(), 0)
-        self.colors = node.getType().startswith("color") or self.category in ("gltf_colorimage", "UsdUVTexture")
+        self.colors = node.getType().startswith("color") or self.category in (
+            "gltf_colorimage",
+            "UsdUVTexture",
+        )
 
     def input(self, name: str) -> Input | None:
         given = self._node.getInput(name)
         if given is None:
-            text = self._node.getAttribute(name)  # documents before 1.38.9 have some of these as attributes
+            text = self._node.getAttribute(
+                name
+            )  # documents before 1.38.9 have some of these as attributes
             return Input(text) if text else None
         node = given.getConnectedNode()
         if node is not None:

@@ -1,8 +1,9 @@
 """What nodes of MaterialX networks give: numbers, pictures, and where these read.
 
-A network is a graph of ``Node``, whatever holds it: a MaterialX document (``materialx_file``) or UsdShade prims
-(``usd_networks``). Pictures are followed through image nodes, transforms of their coordinates and arithmetic, whose
-meaning is that of the MaterialX 1.39 specification (standard nodes) and of the node graphs that come with MaterialX.
+A network is a graph of ``Node``, whatever holds it: a MaterialX document (``materialx_file``) or
+UsdShade prims (``usd_networks``). Pictures are followed through image nodes, transforms of their
+coordinates and arithmetic, whose meaning is that of the MaterialX 1.39 specification (standard
+nodes) and of the node graphs that come with MaterialX.
 """
 
 from __future__ import annotations
@@ -28,8 +29,8 @@ MAX_DEPTH = 64
 
 
 class Node(Protocol):
-    """``category``: "image", "multiply", ...; ``width``: channels of what it gives, 0 if that is no number; ``colors``:
-    are these colours, which alone have a colour space?"""
+    """``category``: "image", "multiply", ...; ``width``: channels of what it gives, 0 if that is no
+    number; ``colors``: are these colours, which alone have a colour space?"""
 
     name: str
     category: str
@@ -48,8 +49,8 @@ class Node(Protocol):
 
 @dataclass(frozen=True)
 class Input:
-    """A constant ``value`` (numbers, or a text), or the ``output`` of a ``node``. ``space``: how colours are encoded,
-    None where nothing says."""
+    """A constant ``value`` (numbers, or a text), or the ``output`` of a ``node``. ``space``: how
+    colours are encoded, None where nothing says."""
 
     value: tuple[float, ...] | str | None = None
     node: Node | None = None
@@ -59,7 +60,12 @@ class Input:
 
 _IMAGES = ("image", "tiledimage", "gltf_image", "gltf_colorimage", "gltf_normalmap", "UsdUVTexture")
 _MEANS_COLORS = ("displayColor", "Cd", "color")
-_WRAPS: dict[str, Wrap] = {"periodic": "repeat", "repeat": "repeat", "mirror": "mirror", "clamp": "clamp"}
+_WRAPS: dict[str, Wrap] = {
+    "periodic": "repeat",
+    "repeat": "repeat",
+    "mirror": "mirror",
+    "clamp": "clamp",
+}
 _CHANNELS = {"r": 0, "x": 0, "g": 1, "y": 1, "b": 2, "z": 2, "a": 3, "w": 3}
 _LUMA = np.array([0.2722287, 0.6740818, 0.0536895], np.float32)
 
@@ -82,12 +88,21 @@ _ARITHMETIC: dict[str, tuple[dict[str, float], Callable[..., NDArray]]] = {
     "max": ({"in1": 0, "in2": 0}, np.maximum),
     "absval": ({"in": 0}, np.abs),
     "invert": ({"in": 0, "amount": 1}, lambda x, amount: amount - x),
-    "clamp": ({"in": 0, "low": 0, "high": 1}, lambda x, low, high: np.minimum(np.maximum(x, low), high)),
+    "clamp": (
+        {"in": 0, "low": 0, "high": 1},
+        lambda x, low, high: np.minimum(np.maximum(x, low), high),
+    ),
     "mix": ({"fg": 0, "bg": 0, "mix": 0}, lambda fg, bg, mix: bg + (fg - bg) * mix),
     "remap": ({"in": 0, "inlow": 0, "inhigh": 1, "outlow": 0, "outhigh": 1}, _remap),
-    "contrast": ({"in": 0, "amount": 1, "pivot": 0.5}, lambda x, amount, pivot: (x - pivot) * amount + pivot),
+    "contrast": (
+        {"in": 0, "amount": 1, "pivot": 0.5},
+        lambda x, amount, pivot: (x - pivot) * amount + pivot,
+    ),
     "luminance": ({"in": 0}, _luminance),
-    "saturate": ({"in": 0, "amount": 1}, lambda x, amount: _luminance(x) * (1 - amount) + x * amount),
+    "saturate": (
+        {"in": 0, "amount": 1},
+        lambda x, amount: _luminance(x) * (1 - amount) + x * amount,
+    ),
 }
 """Inputs with their defaults, and the function of arrays whose last axes are channels."""
 
@@ -126,13 +141,16 @@ def _channels(values: NDArray, width: int) -> NDArray:
         fill = np.repeat(values[..., :1], width, axis=-1)
         if values.shape[-1] > 1:
             fill[..., : values.shape[-1]] = values
-            fill[..., values.shape[-1] :] = np.iinfo(values.dtype).max if values.dtype.kind == "u" else 1
+            fill[..., values.shape[-1] :] = (
+                np.iinfo(values.dtype).max if values.dtype.kind == "u" else 1
+            )
         return fill
     return np.ascontiguousarray(values[..., :width])
 
 
 def normal_map(given: Input, depth: int = 0) -> tuple[Value, float]:
-    """(tangent-space normals stored as (n + 1) / 2, strength) of an input for normals. Raises NotUnderstood."""
+    """(tangent-space normals stored as (n + 1) / 2, strength) of an input for normals. Raises
+    NotUnderstood."""
     node = given.node
     if node is None or depth > MAX_DEPTH:
         raise Missing
@@ -187,7 +205,11 @@ def _channel(value: Value, channel: int) -> Value:
         return replace(value, factor=factor)
     pixels = value.texture.pixels[..., min(channel, value.texture.pixels.shape[2] - 1)][..., None]
     space = "linear" if channel == 3 else value.texture.color_space  # alpha is linear
-    return Value(factor, replace(value.texture, pixels=np.ascontiguousarray(pixels), color_space=space), value.place)
+    return Value(
+        factor,
+        replace(value.texture, pixels=np.ascontiguousarray(pixels), color_space=space),
+        value.place,
+    )
 
 
 def _evaluate(node: Node, depth: int) -> Value:
@@ -204,7 +226,9 @@ def _evaluate(node: Node, depth: int) -> Value:
         return evaluate(node.input("in") or Input((0.0,)), node.width or 1, depth)
     if category.startswith("combine"):
         parts = [get(f"in{k + 1}", 0.0, 1) for k in range(int(category[7:]))]
-        return combine(lambda *channels: np.concatenate(np.broadcast_arrays(*channels), axis=-1), parts)
+        return combine(
+            lambda *channels: np.concatenate(np.broadcast_arrays(*channels), axis=-1), parts
+        )
     if category.startswith("separate"):
         return get("in", 0.0, 4 if category.endswith("4") else 3)
     if category == "extract":
@@ -219,26 +243,39 @@ def _evaluate(node: Node, depth: int) -> Value:
         parts = [fixed[n] if n in fixed else _channel(value, _CHANNELS[n]) for n in names]
         if len(set(names)) == 1:
             return parts[0].adapted(len(names))
-        return combine(lambda *channels: np.concatenate(np.broadcast_arrays(*channels), axis=-1), parts)
+        return combine(
+            lambda *channels: np.concatenate(np.broadcast_arrays(*channels), axis=-1), parts
+        )
     if category == "switch":
         return get(f"in{int(number(node, 'which', 0.0)) + 1}")
     if category in ("geomcolor", "geompropvalue", "UsdPrimvarReader"):
         named = node.input("geomprop") or node.input("varname")
         if category == "geomcolor" or (named is not None and named.value in _MEANS_COLORS):
-            return Value(np.ones(max(node.width, 1), np.float32))  # the mesh's vertex colours take its place
+            return Value(
+                np.ones(max(node.width, 1), np.float32)
+            )  # the mesh's vertex colours take its place
     if category not in _ARITHMETIC:
         raise NotUnderstood(f"the node '{category}'")
     defaults, function = _ARITHMETIC[category]
-    values = [_as_given(node.input(name) or Input((default,)), node.width, depth) for name, default in defaults.items()]
+    values = [
+        _as_given(node.input(name) or Input((default,)), node.width, depth)
+        for name, default in defaults.items()
+    ]
     return combine(
-        function, values, keeps_texture=category == "multiply" or (category == "divide" and not _textured(values[1:]))
+        function,
+        values,
+        keeps_texture=category == "multiply"
+        or (category == "divide" and not _textured(values[1:])),
     )
 
 
 def _as_given(given: Input, width: int, depth: int) -> Value:
     """An argument of arithmetic: as many channels as the result, or the one that it has."""
     alone = (
-        given.node is None and given.value is not None and not isinstance(given.value, str) and len(given.value) == 1
+        given.node is None
+        and given.value is not None
+        and not isinstance(given.value, str)
+        and len(given.value) == 1
     )
     one = alone or (given.node is not None and given.node.width == 1)
     return evaluate(given, 1 if one else width or 1, depth)
@@ -248,8 +285,11 @@ def _textured(values: list[Value]) -> bool:
     return any(v.texture is not None for v in values)
 
 
-def combine(function: Callable[..., NDArray], values: list[Value], keeps_texture: bool = False) -> Value:
-    """A function of values. ``keeps_texture``: it multiplies, so that one picture among constants stays as it is."""
+def combine(
+    function: Callable[..., NDArray], values: list[Value], keeps_texture: bool = False
+) -> Value:
+    """A function of values. ``keeps_texture``: it multiplies, so that one picture among constants
+    stays as it is."""
     pictures = [v for v in values if v.texture is not None]
     if not pictures:
         with np.errstate(all="ignore"):
@@ -260,8 +300,12 @@ def combine(function: Callable[..., NDArray], values: list[Value], keeps_texture
         return replace(pictures[0], factor=factor).adapted(len(factor))
     if any(not v.place.equals(pictures[0].place) for v in pictures):
         raise NotUnderstood("pictures at different places, one combined with the other")
-    height, width = (max(v.texture.pixels.shape[k] for v in pictures if v.texture is not None) for k in (0, 1))
-    arrays = [v.linear() if v.texture is None else resize(v.linear(), height, width) for v in values]
+    height, width = (
+        max(v.texture.pixels.shape[k] for v in pictures if v.texture is not None) for k in (0, 1)
+    )
+    arrays = [
+        v.linear() if v.texture is None else resize(v.linear(), height, width) for v in values
+    ]
     with np.errstate(all="ignore"):
         pixels = np.ascontiguousarray(function(*arrays), np.float32)
     if not np.isfinite(pixels).all():
@@ -292,12 +336,17 @@ def _image(node: Node, depth: int) -> Value:
         if default is None:
             raise Missing
         return evaluate(default, node.width or 3, depth)
-    several = node.category in ("gltf_colorimage", "UsdUVTexture")  # they have channels as outputs of their own
+    several = node.category in (
+        "gltf_colorimage",
+        "UsdUVTexture",
+    )  # they have channels as outputs of their own
     width = (pixels.shape[2] if pixels.shape[2] == 4 else 3) if several else node.width or 3
     pixels = pixels[..., :1] if width == 1 else _channels(images.to_color(pixels), width)
     file = node.input("file")
     given = file.space if file is not None else None
-    space: ColorSpace = (given or ("srgb" if pixels.dtype == np.uint8 else "linear")) if node.colors else "linear"
+    space: ColorSpace = (
+        (given or ("srgb" if pixels.dtype == np.uint8 else "linear")) if node.colors else "linear"
+    )
     wraps = [node.input(n) or node.input(f"wrap{n[0].upper().replace('U', 'S').replace('V', 'T')}")
              for n in ("uaddressmode", "vaddressmode")]  # fmt: skip
     u, v = (_WRAPS.get(str(w.value), "clamp") if w is not None else "repeat" for w in wraps)
@@ -314,7 +363,10 @@ def _image(node: Node, depth: int) -> Value:
         if tint is not None:
             factor = evaluate(tint, width, depth).factor
     elif node.category == "UsdUVTexture":
-        scale, bias = (evaluate(node.input(n) or Input((d,)), width).factor for n, d in (("scale", 1.0), ("bias", 0.0)))
+        scale, bias = (
+            evaluate(node.input(n) or Input((d,)), width).factor
+            for n, d in (("scale", 1.0), ("bias", 0.0))
+        )
         factor = scale
         if bias.any():
             value = Value(scale, texture, place)
@@ -323,7 +375,8 @@ def _image(node: Node, depth: int) -> Value:
 
 
 def _coordinates(given: Input | None, depth: int) -> Place:
-    """Where an image reads: which set of texture coordinates, and through which transform. Raises NotUnderstood."""
+    """Where an image reads: which set of texture coordinates, and through which transform. Raises
+    NotUnderstood."""
     if given is None or given.node is None:
         return Place()
     if depth > MAX_DEPTH:
@@ -337,20 +390,28 @@ def _coordinates(given: Input | None, depth: int) -> Place:
         name = str(named.value) if named is not None and named.value else "st"
         return Place({"UV0": "st", "UV1": "st1"}.get(name, name))
     if node.category == "place2d":
-        scale, move, pivot = _pair(node, "scale", 1.0), _pair(node, "offset", 0.0), _pair(node, "pivot", 0.0)
+        scale, move, pivot = (
+            _pair(node, "scale", 1.0),
+            _pair(node, "offset", 0.0),
+            _pair(node, "pivot", 0.0),
+        )
         turn = _rotation(number(node, "rotate", 0.0))
         if int(number(node, "operationorder", 0.0)) == 0:
             linear, offset = turn @ np.diag(1 / scale), -move
         else:
             linear = np.diag(1 / scale) @ turn
             offset = -linear @ move
-        return _coordinates(before, depth + 1).then(_upward(linear, offset - linear @ pivot + pivot))
+        return _coordinates(before, depth + 1).then(
+            _upward(linear, offset - linear @ pivot + pivot)
+        )
     if node.category == "UsdTransform2d":
         scale, move = _pair(node, "scale", 1.0), _pair(node, "translation", 0.0)
         matrix = uv_transforms.usd_affine(tuple(scale), number(node, "rotation", 0.0), tuple(move))
         return _coordinates(before, depth + 1).then(matrix)
     if node.category == "rotate2d":
-        return _coordinates(before, depth + 1).then(_upward(_rotation(number(node, "amount", 0.0)), np.zeros(2)))
+        return _coordinates(before, depth + 1).then(
+            _upward(_rotation(number(node, "amount", 0.0)), np.zeros(2))
+        )
     if node.category in ("dot", "convert"):
         return _coordinates(before, depth + 1)
     if node.category in ("multiply", "divide", "add", "subtract"):
@@ -360,15 +421,21 @@ def _coordinates(given: Input | None, depth: int) -> Place:
         value = evaluate(by or Input((1.0,)), 2, depth)
         if value.texture is None:
             v = value.factor.astype(np.float64)
-            scales = {"multiply": v, "divide": 1 / v} if node.category in ("multiply", "divide") else {}
+            scales = (
+                {"multiply": v, "divide": 1 / v} if node.category in ("multiply", "divide") else {}
+            )
             moves = {"add": v, "subtract": -v}
-            matrix = _upward(np.diag(scales.get(node.category, np.ones(2))), moves.get(node.category, np.zeros(2)))
+            matrix = _upward(
+                np.diag(scales.get(node.category, np.ones(2))),
+                moves.get(node.category, np.zeros(2)),
+            )
             return _coordinates(first, depth + 1).then(matrix)
     raise NotUnderstood(f"the node '{node.category}' among texture coordinates")
 
 
 def _gltf_transform(node: Node) -> NDArray[np.float64]:
-    """KHR_texture_transform as the gltf_ nodes have it: they call place2d with what undoes its conventions."""
+    """KHR_texture_transform as the gltf_ nodes have it: they call place2d with what undoes its
+    conventions."""
     scale, move, pivot = _pair(node, "scale", 1.0), _pair(node, "offset", 0.0), np.array([0.0, 1.0])
     given = node.input("pivot")
     pivot = pivot if given is None else _pair(node, "pivot", 0.0)

@@ -33,7 +33,8 @@ _MAP_OPTIONS = {
 """Options of map statements and how many values follow them, at most for those of ``_OPTIONAL``."""
 
 _OPTIONAL = ("-o", "-s", "-t")
-"""Options whose second and third values may be left out (MTL specification, "Options for texture map statements")."""
+"""Options whose second and third values may be left out (MTL specification, "Options for texture
+map statements")."""
 
 _NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?")
 
@@ -41,27 +42,28 @@ _COMMENT = re.compile(r"\s#")
 
 _NORMAL, _BUMP = ("norm", "map_kn"), ("map_bump", "bump")
 _USED = ("map_kd", "map_pr", "map_pm", "map_ke", "map_ka", "map_d", "map_aat", *_NORMAL, *_BUMP)
-"""Maps that are read; that of the ambient colour, which lights nothing here, usually repeats the diffuse one, and
-``map_aat`` is a switch, not a map."""
+"""Maps that are read; that of the ambient colour, which lights nothing here, usually repeats the
+diffuse one, and ``map_aat`` is a switch, not a map."""
 
 _FILES = ("map_", "norm", "bump", "disp", "decal", "refl")
 """Start of the statements that name a file, whether it is read or not."""
 
 WITHOUT_MAP, LOST = "# without its map: ", "lost:"
-"""Start of the comments in which our own files keep a constant for when its map gets lost, and what stands for it here
-before the constant's key. The maps hold the factors there, and the constants beside them are 1 (see ``obj_write``)."""
+"""Start of the comments in which our own files keep a constant for when its map gets lost, and what
+stands for it here before the constant's key. The maps hold the factors there, and the constants
+beside them are 1 (see ``obj_write``)."""
 
 UNLIT_MARK, UNLIT = "# unlit", "unlit"
-"""Comment by which our own files say that a material is shown without light, and its key here. Others that write
-"illum 0", which means that, too, seldom mean it."""
+"""Comment by which our own files say that a material is shown without light, and its key here.
+Others that write "illum 0", which means that, too, seldom mean it."""
 
 ALPHA_TEST, TESTED = "# alpha test: ", "tested"
-"""Start of the comment in which our own files keep the cutoff of a material with the alpha mode "mask", for which the
-format has no word, and its key here."""
+"""Start of the comment in which our own files keep the cutoff of a material with the alpha mode
+"mask", for which the format has no word, and its key here."""
 
 UNIT, MOSTLY = 0.1, 0.9
-"""A picture is taken for a normal map if at least the share ``MOSTLY`` of its texels, decoded, have a length within
-``UNIT`` of 1 and point outward."""
+"""A picture is taken for a normal map if at least the share ``MOSTLY`` of its texels, decoded, have
+a length within ``UNIT`` of 1 and point outward."""
 
 
 @dataclass(frozen=True)
@@ -78,8 +80,9 @@ class _Map:
 
 
 class MaterialReader:
-    """Materials of the MTL files of one OBJ file: ``by_name``, and by ``id`` of a material the ``transforms`` of its
-    textures (see ``uv_unification.unify``), and what reads its ``tiles`` if they have any (see ``udim.split``)."""
+    """Materials of the MTL files of one OBJ file: ``by_name``, and by ``id`` of a material the
+    ``transforms`` of its textures (see ``uv_unification.unify``), and what reads its ``tiles`` if
+    they have any (see ``udim.split``)."""
 
     def __init__(self, companions: Companions) -> None:
         self.companions, self.note = companions, companions.note
@@ -117,12 +120,16 @@ class MaterialReader:
             if any(udim.is_tiled(v) for v in values.values()):
                 self.tiles[id(self.by_name[name])] = partial(self._material, name, values, path)
 
-    def _material(self, name: str, values: dict[str, str], path: Path, tile: Tile | None = None) -> Material:
+    def _material(
+        self, name: str, values: dict[str, str], path: Path, tile: Tile | None = None
+    ) -> Material:
         try:
             one = _Statements(name, values, path, self.companions, tile)
             material = one.material()
         except (ValueError, IndexError):
-            raise InputError(f"{path}: a value of material '{name}' is missing or not a number") from None
+            raise InputError(
+                f"{path}: a value of material '{name}' is missing or not a number"
+            ) from None
         self.transforms[id(material)] = one.transforms
         return material
 
@@ -132,17 +139,30 @@ class MaterialReader:
 
 
 class _Statements:
-    """The statements of one material, by lower-case key; of one tile of its textures, or without those in tiles."""
+    """The statements of one material, by lower-case key; of one tile of its textures, or without
+    those in tiles."""
 
     def __init__(
-        self, name: str, values: dict[str, str], path: Path, companions: Companions, tile: Tile | None
+        self,
+        name: str,
+        values: dict[str, str],
+        path: Path,
+        companions: Companions,
+        tile: Tile | None,
     ) -> None:
-        self.name, self.values, self.path, self.companions, self.tile = name, values, path, companions, tile
+        self.name, self.values, self.path, self.companions, self.tile = (
+            name,
+            values,
+            path,
+            companions,
+            tile,
+        )
         self.transforms: dict[str, uv_transforms.UvTransform] = {}
 
     def material(self) -> Material:
-        """Phong exponents become roughness sqrt(2 / (Ns + 2)). Constants beside a map are ignored, for many exporters
-        write 0 or 0.8 there, and Blender ignores them, too; without the map they count."""
+        """Phong exponents become roughness sqrt(2 / (Ns + 2)). Constants beside a map are ignored,
+        for many exporters write 0 or 0.8 there, and Blender ignores them, too; without the map they
+        count."""
         color = self._numbers("kd", [0.8, 0.8, 0.8])
         color = color * 3 if len(color) == 1 else color
         base = self._texture("base_color_texture", "map_kd", space="srgb")
@@ -165,7 +185,9 @@ class _Statements:
             metalness=1.0 if metal_map is not None else self._numbers("pm", [0.0])[0],
             normal_scale=strength,
             base_color_texture=base if alpha_map is None else with_alpha(base, alpha_map),
-            orm_texture=None if rough_map is None and metal_map is None else pack_orm(rough_map, metal_map),
+            orm_texture=None
+            if rough_map is None and metal_map is None
+            else pack_orm(rough_map, metal_map),
             normal_texture=normal,
             opacity=opacity,
             alpha_mode=self._alpha_mode(opacity < 1 or alpha_map is not None),
@@ -180,19 +202,24 @@ class _Statements:
         return default if text is None else [float(w) for w in text.split()[:3]]
 
     def _normal(self) -> tuple[Texture | None, float]:
-        """(normal map, strength). What is named as a bump map is often one; a true bump map holds heights, and has no
-        place here."""
+        """(normal map, strength). What is named as a bump map is often one; a true bump map holds
+        heights, and has no place here."""
         key = next((k for k in (*_NORMAL, *_BUMP) if k in self.values), None)
         if key is None:
             return None, 1.0
         texture = self._texture("normal_texture", key)
         if texture is not None and key in _BUMP and not looks_like_normals(texture):
-            self._note(f"its bump map '{_map(self.values[key]).file}' ignored: it holds heights, not normals")
+            self._note(
+                f"its bump map '{_map(self.values[key]).file}' ignored: it holds heights, not normals"
+            )
             return None, 1.0
         return texture, _map(self.values[key]).strength
 
-    def _texture(self, slot: str, key: str, space: ColorSpace = "linear", one_channel: bool = False) -> Texture | None:
-        """The map of a statement; None without one, or if it is missing and that is to be ignored."""
+    def _texture(
+        self, slot: str, key: str, space: ColorSpace = "linear", one_channel: bool = False
+    ) -> Texture | None:
+        """The map of a statement; None without one, or if it is missing and that is to be
+        ignored."""
         if key not in self.values:
             return None
         given = _map(self.values[key])
@@ -203,7 +230,9 @@ class _Statements:
             return None
         if given.ignored:
             self._note(f"{' '.join(given.ignored)} of {key} ignored")
-        if slot in self.transforms and not np.allclose(self.transforms[slot].matrix, given.transform):
+        if slot in self.transforms and not np.allclose(
+            self.transforms[slot].matrix, given.transform
+        ):
             which = "roughness and metalness" if slot == "orm_texture" else "colour and alpha"
             self._note(f"the maps of {which} differ in transform: the first one's is used for both")
         self.transforms.setdefault(slot, uv_transforms.UvTransform(given.transform))
@@ -211,7 +240,9 @@ class _Statements:
             channel = given.channel
             if channel is None:  # what is named as a map of alpha is often a picture with alpha
                 alpha = pixels.shape[2] - 1
-                has_alpha = key == "map_d" and alpha in (1, 3) and pixels[..., alpha].min() < _one(pixels)
+                has_alpha = (
+                    key == "map_d" and alpha in (1, 3) and pixels[..., alpha].min() < _one(pixels)
+                )
                 channel = alpha if has_alpha else 0
             pixels = pixels[..., min(channel, pixels.shape[2] - 1)][..., None]
         else:
@@ -224,7 +255,8 @@ class _Statements:
         return udim.fit_to_tile(texture, self.tile, self.companions)
 
     def _pixels(self, file: str) -> NDArray | None:
-        """None if the file is missing and that is to be ignored, or if it is one in tiles and none is asked for."""
+        """None if the file is missing and that is to be ignored, or if it is one in tiles and none
+        is asked for."""
 
         def read(name: str) -> NDArray:
             try:
@@ -244,7 +276,8 @@ class _Statements:
         return udim.read_tile(file, self.tile, self.path, self.companions, read)
 
     def _opacity(self) -> tuple[float, Texture | None]:
-        """(factor, map) of alpha. The format has no alpha test: our own files keep theirs in a comment."""
+        """(factor, map) of alpha. The format has no alpha test: our own files keep theirs in a
+        comment."""
         alpha_map = self._texture("base_color_texture", "map_d", one_channel=True)
         if alpha_map is not None:
             return 1.0, alpha_map
@@ -252,7 +285,9 @@ class _Statements:
         if "d" in self.values:
             opacity = float(self.values["d"].split()[-1])  # it may have the option -halo
         if opacity <= 0:
-            self._note("says that nothing of it is seen (d 0 or Tr 1), as some exporters do of all: drawn opaque")
+            self._note(
+                "says that nothing of it is seen (d 0 or Tr 1), as some exporters do of all: drawn opaque"
+            )
             opacity = 1.0
         return opacity, None
 
@@ -272,14 +307,17 @@ class _Statements:
 
 
 def _map(statement: str) -> _Map:
-    """The parts of a map statement. The name of the file, which may have spaces and quotation marks, is what is left
-    after the options. Raises ValueError and IndexError for values that are missing."""
+    """The parts of a map statement. The name of the file, which may have spaces and quotation
+    marks, is what is left after the options. Raises ValueError and IndexError for values that are
+    missing."""
     found: dict[str, list[str]] = {}
     rest = statement.strip()
     while (option := rest.split(None, 1)[0] if rest else "") in _MAP_OPTIONS:
         values, rest = _taken(rest[len(option) :].lstrip(), option)
         found[option] = values
-    offset, scale = (_numbers(found.get(o, []), default) for o, default in (("-o", 0.0), ("-s", 1.0)))
+    offset, scale = (
+        _numbers(found.get(o, []), default) for o, default in (("-o", 0.0), ("-s", 1.0))
+    )
     ignored = [o for o in ("-t", "-mm", "-boost") if o in found]
     if found.get("-mm") and [float(x) for x in found["-mm"]] == [0, 1]:
         ignored.remove("-mm")

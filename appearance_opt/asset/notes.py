@@ -25,17 +25,17 @@ class _Kind:
 class Notes:
     """Collects notes, each told once, in the order in which they came.
 
-    A note of the form ``material 'a': what`` is of one kind with others of ``what``, and so are ``mesh 'a': 3 faces
-    dropped`` and ``mesh 'b': 4 faces dropped``: they become one line, which gives the first names, counts the others
-    and sums the numbers.
+    A note of the form ``material 'a': what`` is of one kind with others of ``what``, and so are
+    ``mesh 'a': 3 faces dropped`` and ``mesh 'b': 4 faces dropped``: they become one line, which
+    gives the first names, counts the others and sums the numbers.
     """
 
     def __init__(self) -> None:
         self._kinds: dict[tuple[str, ...], _Kind] = {}
 
     def __call__(self, text: str, kind: str | None = None) -> None:
-        """Add a note. ``kind``: for one without a subject, what it has in common with others: of these the first
-        ``LINES`` are told in full."""
+        """Add a note. ``kind``: for one without a subject, what it has in common with others: of
+        these the first ``LINES`` are told in full."""
         subject = _SUBJECT.fullmatch(text) if kind is None else None
         if subject is None:
             self._kinds.setdefault(("", kind or text), _Kind()).names[text] = None

@@ -27,8 +27,11 @@ MAX_INDEX = 2**31 - 1
 """Largest index of a face's corner (they are kept in 32 bits)."""
 
 
-def load_obj(path: Path, companions: Companions, keep_layout: bool = False, crease_angle: float | None = None) -> Asset:
-    """Read an OBJ file and its materials. ``keep_layout``, ``crease_angle``: see ``asset.load``. Raises InputError."""
+def load_obj(
+    path: Path, companions: Companions, keep_layout: bool = False, crease_angle: float | None = None
+) -> Asset:
+    """Read an OBJ file and its materials. ``keep_layout``, ``crease_angle``: see ``asset.load``.
+    Raises InputError."""
     path = Path(path)
     text = re.sub(r"\\\r?\n", " ", read_text(path))
     parser = _Parser(path, companions)
@@ -36,7 +39,9 @@ def load_obj(path: Path, companions: Companions, keep_layout: bool = False, crea
         try:
             parser.line(line)
         except (ValueError, IndexError):
-            raise InputError(f"{path}, line {number}: cannot be read: '{line.strip()[:60]}'") from None
+            raise InputError(
+                f"{path}, line {number}: cannot be read: '{line.strip()[:60]}'"
+            ) from None
     return parser.asset(keep_layout, crease_angle)
 
 
@@ -136,9 +141,11 @@ class _Parser:
         ]
         meshes, origin = settle([mesh for mesh, _ in read], self.companions.note)
         if not keep_layout:
-            # once a file says anything of smoothing, faces without a group are flat, as the format says;
-            # of one that does not, as scans are, nothing is known
-            groups = [np.array(g)[face] for g, (_, face) in zip(self.groups.values(), read, strict=True)]
+            # once a file says anything of smoothing, faces without a group are flat, as the format
+            # says; of one that does not, as scans are, nothing is known
+            groups = [
+                np.array(g)[face] for g, (_, face) in zip(self.groups.values(), read, strict=True)
+            ]
             meshes = add_normals(meshes, groups if self.says_groups else None, crease_angle)
         meshes = self.materials.apply_uv_transforms(meshes, keep_layout)
         return Asset(tuple(meshes), self.path.stem, self.companions.notes.lines(), origin=origin)
@@ -151,7 +158,9 @@ class _Parser:
         indices[:, [k for k, has in ((1, has_uv), (2, has_normal)) if not has]] = -1
         of_kind, index = unique_rows(indices + 1)
         used = indices[of_kind]
-        for k, (what, rows) in enumerate((("position", self.positions), ("uv", self.uvs), ("normal", self.normals))):
+        for k, (what, rows) in enumerate(
+            (("position", self.positions), ("uv", self.uvs), ("normal", self.normals))
+        ):
             if used[:, k].max() >= len(rows) and used[:, k].max() >= 0:
                 raise InputError(
                     f"{self.path}: a face refers to {what} {used[:, k].max() + 1}, but there are {len(rows)}"
@@ -160,7 +169,9 @@ class _Parser:
         if any(len(v) < 3 for v in vertices):
             raise InputError(f"{self.path}: a vertex has fewer than three coordinates")
         positions = np.array([v[:3] for v in vertices], np.float64)
-        corners, polygon = triangulate(Polygons(np.array([len(p) for p in polygons]), index), positions)
+        corners, polygon = triangulate(
+            Polygons(np.array([len(p) for p in polygons]), index), positions
+        )
         has_color = all(len(v) == 6 for v in vertices)
         uvs = np.array([self.uvs[i] for i in used[:, 1]], np.float32) if has_uv else None
         if uvs is not None:
@@ -173,9 +184,14 @@ class _Parser:
             faces=index[corners].astype(np.int32),
             normals=_unit(np.array(normals, np.float64)) if has_normal else None,
             uvs=uvs,
-            # sRGB encoded, as Blender and MeshLab write and read them: the format itself does not say
-            colors=srgb_to_linear(np.array([v[3:6] for v in vertices], np.float32)) if has_color else None,
-            material=self.materials.by_name.get(name, Material(name=name or "material", roughness=0.8)),
+            # sRGB encoded, as Blender and MeshLab write and read them: the format itself does not
+            # say
+            colors=srgb_to_linear(np.array([v[3:6] for v in vertices], np.float32))
+            if has_color
+            else None,
+            material=self.materials.by_name.get(
+                name, Material(name=name or "material", roughness=0.8)
+            ),
             name=name or self.path.stem,
         )
         return mesh, polygon

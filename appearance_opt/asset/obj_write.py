@@ -26,18 +26,23 @@ if TYPE_CHECKING:
 def save_obj(asset: Asset, path: Path) -> None:
     """Write OBJ, MTL (with the PBR extension: Pr, Pm, map_Pr, map_Pm, norm) and PNG textures.
 
-    Vertex colours follow the positions, sRGB encoded, as Blender and MeshLab write and read them; the format has no
-    place for their alpha. What light passes through becomes alpha: of ``alpha.coverage``.
+    Vertex colours follow the positions, sRGB encoded, as Blender and MeshLab write and read them;
+    the format has no place for their alpha. What light passes through becomes alpha: of
+    ``alpha.coverage``.
     """
     # the number keeps names apart that are equal, or become so
     look = {id(m.material): apart_from_sides(m.material) for m in asset.meshes}
-    named = {look[id(m.material)]: f"{i}_{_word(m.material.name)}" for i, m in enumerate(asset.meshes)}
+    named = {
+        look[id(m.material)]: f"{i}_{_word(m.material.name)}" for i, m in enumerate(asset.meshes)
+    }
     mtl = ["# appearance-opt"]
     for key, m in {look[id(m.material)]: m.material for m in asset.meshes}.items():
         mtl += _mtl_lines(replace(m, name=named[key]), path)
     path.with_suffix(".mtl").write_text("\n".join(mtl) + "\n", encoding="utf-8")
     lines = ["# appearance-opt", f"mtllib {path.stem}.mtl"]
-    start = np.ones(3, np.int64)  # of this mesh's positions, texture coordinates and normals in the whole file
+    start = np.ones(
+        3, np.int64
+    )  # of this mesh's positions, texture coordinates and normals in the whole file
     for mesh in asset.meshes:
         lines += [
             f"o {' '.join(mesh.name.split())}",
@@ -46,7 +51,11 @@ def save_obj(asset: Asset, path: Path) -> None:
         ]
         # vertices are split at seams: one index serves all that a mesh has
         has = (True, mesh.uvs is not None, mesh.normals is not None)
-        form = {(True, False): "{0}/{1}", (False, True): "{0}//{2}", (True, True): "{0}/{1}/{2}"}.get(has[1:], "{0}")
+        form = {
+            (True, False): "{0}/{1}",
+            (False, True): "{0}//{2}",
+            (True, True): "{0}/{1}/{2}",
+        }.get(has[1:], "{0}")
         for face in mesh.faces.tolist():
             lines.append("f " + " ".join(form.format(*(start + i)) for i in face))
         start += np.where(has, len(mesh.positions), 0)
@@ -63,7 +72,10 @@ def _vertices(mesh: Mesh, origin: tuple[float, float, float]) -> list[str]:
     lines = ["v " + form.format(*row) for row in positions.tolist()]
     if mesh.colors is not None:
         encoded = linear_to_srgb(np.clip(mesh.colors[:, :3], 0, 1)).tolist()
-        lines = [f"{line} {r:.9g} {g:.9g} {b:.9g}" for line, (r, g, b) in zip(lines, encoded, strict=True)]
+        lines = [
+            f"{line} {r:.9g} {g:.9g} {b:.9g}"
+            for line, (r, g, b) in zip(lines, encoded, strict=True)
+        ]
     if mesh.uvs is not None:
         lines += [f"vt {u:.9g} {1 - v:.9g}" for u, v in mesh.uvs.tolist()]
     if mesh.normals is not None:
@@ -74,9 +86,9 @@ def _vertices(mesh: Mesh, origin: tuple[float, float, float]) -> list[str]:
 def _mtl_lines(m: Material, path: Path) -> list[str]:
     """The statements of a material, whose textures are written beside ``path``.
 
-    Readers differ in whether Kd, Pr and Pm multiply their maps (the Wavefront convention) or stand back for them
-    (Blender): the maps hold the factors, and the constants are 1. A comment keeps the factor alone, for when the map
-    gets lost.
+    Readers differ in whether Kd, Pr and Pm multiply their maps (the Wavefront convention) or stand
+    back for them (Blender): the maps hold the factors, and the constants are 1. A comment keeps the
+    factor alone, for when the map gets lost.
     """
 
     def picture(suffix: str, pixels: NDArray) -> str:
@@ -114,11 +126,15 @@ def _mtl_lines(m: Material, path: Path) -> list[str]:
             lines.append("map_Ke " + picture("emission", encoded_for(m.emission_texture, "srgb")))
     if m.normal_texture is not None and not m.unlit:
         strength = "" if m.normal_scale == 1 else f"-bm {m.normal_scale:.6g} "
-        lines.append(f"norm {strength}" + picture("normal", encoded_for(m.normal_texture, "linear")[..., :3]))
+        lines.append(
+            f"norm {strength}" + picture("normal", encoded_for(m.normal_texture, "linear")[..., :3])
+        )
     factor, alpha = coverage(m)
     if factor < 1 or alpha is not None:
         # readers differ in whether d multiplies its map, too
-        mapped = None if alpha is None else picture("alpha", encoded_for(alpha, "linear", (factor,)))
+        mapped = (
+            None if alpha is None else picture("alpha", encoded_for(alpha, "linear", (factor,)))
+        )
         lines += [f"d {factor:.6g}"] if mapped is None else ["d 1", f"map_d {mapped}"]
         lines += [f"{ALPHA_TEST}{m.alpha_cutoff:.6g}"] if kind_of(m) == "mask" else []
     return [*lines, ""]

@@ -30,9 +30,9 @@ def resize(pixels: NDArray[np.float32], height: int, width: int) -> NDArray[np.f
 
 
 def pack_orm(roughness: Texture | None, metalness: Texture | None) -> Texture:
-    """One (H, W, 3) texture from the first channels of two, either of which may be missing (1 then, so
-    that the material's factor decides). The smaller is brought to the size of the larger; 8-bit maps
-    of one size, linear ones, stay 8 bit."""
+    """One (H, W, 3) texture from the first channels of two, either of which may be missing (1 then,
+    so that the material's factor decides). The smaller is brought to the size of the larger; 8-bit
+    maps of one size, linear ones, stay 8 bit."""
     given = [t for t in (roughness, metalness) if t is not None]
     height = max(t.pixels.shape[0] for t in given)
     width = max(t.pixels.shape[1] for t in given)
@@ -42,7 +42,10 @@ def pack_orm(roughness: Texture | None, metalness: Texture | None) -> Texture:
         planes = [None if t is None else t.pixels[..., 0] for t in (roughness, metalness)]
     else:
         out = np.ones((height, width, 3), np.float32)
-        planes = [None if t is None else resize(t.linear(), height, width)[..., 0] for t in (roughness, metalness)]
+        planes = [
+            None if t is None else resize(t.linear(), height, width)[..., 0]
+            for t in (roughness, metalness)
+        ]
     for channel, plane in zip((1, 2), planes, strict=True):
         if plane is not None:
             out[..., channel] = plane
@@ -50,7 +53,8 @@ def pack_orm(roughness: Texture | None, metalness: Texture | None) -> Texture:
 
 
 def with_occlusion(orm: Texture | None, occlusion: Texture) -> Texture:
-    """A texture of roughness and metalness (1 without one) with the first channel of another as its occlusion."""
+    """A texture of roughness and metalness (1 without one) with the first channel of another as its
+    occlusion."""
     return _replace(_white(occlusion) if orm is None else orm, 0, occlusion)
 
 
@@ -65,8 +69,9 @@ def _white(like: Texture) -> Texture:
 
 
 def _replace(texture: Texture, channel: int, source: Texture) -> Texture:
-    """A texture whose ``channel`` (one more than there are, too) is the first one of another. The smaller of the two is
-    brought to the size of the larger; those of one size and depth keep their texels."""
+    """A texture whose ``channel`` (one more than there are, too) is the first one of another. The
+    smaller of the two is brought to the size of the larger; those of one size and depth keep their
+    texels."""
     height, width = (max(t.pixels.shape[k] for t in (texture, source)) for k in (0, 1))
     stored = texture.pixels.dtype == source.pixels.dtype and source.color_space == "linear"
     if stored and texture.pixels.shape[:2] == source.pixels.shape[:2]:
@@ -79,10 +84,12 @@ def _replace(texture: Texture, channel: int, source: Texture) -> Texture:
 
 
 def pack_emission(values: NDArray[np.float32]) -> tuple[tuple[float, float, float], Texture | None]:
-    """(factor, clamped sRGB texture) of linear emission (H, W, 3). The factor is its largest value; there is no texture
-    where that is 0."""
+    """(factor, clamped sRGB texture) of linear emission (H, W, 3). The factor is its largest value;
+    there is no texture where that is 0."""
     strength = float(values.max(initial=0.0))
     if strength <= 0:
         return (0.0, 0.0, 0.0), None
     encoded = linear_to_srgb(np.clip(values / np.float32(strength), 0, 1))
-    return (strength,) * 3, Texture((encoded * 255 + 0.5).astype(np.uint8), "srgb", ("clamp", "clamp"))
+    return (strength,) * 3, Texture(
+        (encoded * 255 + 0.5).astype(np.uint8), "srgb", ("clamp", "clamp")
+    )

@@ -15,10 +15,13 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
 
-def resolve(reference: str, owner: Path, percent_encoded: bool = False, root: Path | None = None) -> Path:
-    """Path of a file that ``owner`` refers to, or of the only one whose name differs from that in upper and lower case:
-    many writers work where that makes no difference. Raises InputError when it lies neither in owner's folder nor in
-    ``root`` (an asset must not read what it does not own), MissingFileError when it does not exist."""
+def resolve(
+    reference: str, owner: Path, percent_encoded: bool = False, root: Path | None = None
+) -> Path:
+    """Path of a file that ``owner`` refers to, or of the only one whose name differs from that in
+    upper and lower case: many writers work where that makes no difference. Raises InputError when
+    it lies neither in owner's folder nor in ``root`` (an asset must not read what it does not own),
+    MissingFileError when it does not exist."""
     text = unquote(reference, errors="surrogateescape") if percent_encoded else reference
     if "\0" in text or (urlparse(text).scheme and len(urlparse(text).scheme) > 1):
         raise InputError(f"{owner}: refers to '{reference}', which is not a file beside it")
@@ -26,7 +29,11 @@ def resolve(reference: str, owner: Path, percent_encoded: bool = False, root: Pa
     try:
         path = (folder / text.replace("\\", "/")).resolve()
         exists = path.is_file()
-    except (OSError, ValueError, RuntimeError):  # names too long for the file system, loops of links
+    except (
+        OSError,
+        ValueError,
+        RuntimeError,
+    ):  # names too long for the file system, loops of links
         raise InputError(f"{owner}: refers to '{reference[:80]}', which is no file name") from None
     check_inside(path, owner, reference, root)
     if exists:
@@ -41,7 +48,8 @@ def resolve(reference: str, owner: Path, percent_encoded: bool = False, root: Pa
 
 
 def check_inside(path: Path, owner: Path, reference: str, root: Path | None = None) -> None:
-    """Raise InputError if ``path``, which ``owner`` calls ``reference``, lies neither in its folder nor in ``root``."""
+    """Raise InputError if ``path``, which ``owner`` calls ``reference``, lies neither in its folder
+    nor in ``root``."""
     allowed = [owner.resolve().parent, *([] if root is None else [root.resolve()])]
     if not any(path.resolve().is_relative_to(folder) for folder in allowed):
         raise InputError(
@@ -61,12 +69,14 @@ def without_stray_bytes(text: str) -> str:
 
 
 def differing_in_case(path: Path) -> Path | None:
-    """The one file that there is under a name which differs from ``path`` in upper and lower case only; None if there
-    is none, or more than one."""
+    """The one file that there is under a name which differs from ``path`` in upper and lower case
+    only; None if there is none, or more than one."""
     found = [Path(path.anchor)]
     for part in path.parts[1:]:
         within = [p / part for p in found if (p / part).exists()]
-        found = within or [q for p in found if p.is_dir() for q in _list_files(p) if q.name.lower() == part.lower()]
+        found = within or [
+            q for p in found if p.is_dir() for q in _list_files(p) if q.name.lower() == part.lower()
+        ]
     files = [p for p in found if p.is_file()]
     return files[0] if len(files) == 1 else None
 
@@ -79,11 +89,15 @@ def _list_files(folder: Path) -> list[Path]:
 
 
 def read_text(path: Path, encoding: str = "utf-8") -> str:
-    """Text of a file, without its byte order mark, which also says how it is encoded: UTF-8 or UTF-16. Bytes that are
-    no UTF-8 stay what they are, as ``os.fsdecode`` keeps those of names. Raises InputError when it cannot be read or is
-    empty."""
+    """Text of a file, without its byte order mark, which also says how it is encoded: UTF-8 or
+    UTF-16. Bytes that are no UTF-8 stay what they are, as ``os.fsdecode`` keeps those of names.
+    Raises InputError when it cannot be read or is empty."""
     data = read_bytes(path)
-    marks = ((codecs.BOM_UTF8, "utf-8"), (codecs.BOM_UTF16_LE, "utf-16-le"), (codecs.BOM_UTF16_BE, "utf-16-be"))
+    marks = (
+        (codecs.BOM_UTF8, "utf-8"),
+        (codecs.BOM_UTF16_LE, "utf-16-le"),
+        (codecs.BOM_UTF16_BE, "utf-16-be"),
+    )
     for mark, marked in marks:
         if data.startswith(mark):
             data, encoding = data[len(mark) :], marked

@@ -1,7 +1,7 @@
 """PLY to an Asset, through the package plyfile: polygons, vertex or face colours, textures.
 
-The format fixes no names beyond x, y, z and vertex_indices; those of colours, texture coordinates and pictures are what
-MeshLab, Blender, CloudCompare, VCGLib and photogrammetry tools write.
+The format fixes no names beyond x, y, z and vertex_indices; those of colours, texture coordinates
+and pictures are what MeshLab, Blender, CloudCompare, VCGLib and photogrammetry tools write.
 """
 
 from __future__ import annotations
@@ -28,14 +28,20 @@ if TYPE_CHECKING:
     from appearance_opt.asset.companions import Companions
 
 _FACES = ("vertex_indices", "vertex_index")
-_COLORS = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b"))
+_COLORS = (
+    ("red", "green", "blue"),
+    ("diffuse_red", "diffuse_green", "diffuse_blue"),
+    ("r", "g", "b"),
+)
 _UVS = (("texture_u", "texture_v"), ("u", "v"), ("s", "t"), ("texture_s", "texture_t"))
 _PICTURE = re.compile(r"TextureFile\s+(.+)", re.IGNORECASE)
 _HEADER = 1 << 16
 """Bytes in which the header of a file is looked for the lists of its faces."""
 
 
-def load_ply(path: Path, companions: Companions, keep_layout: bool = False, crease_angle: float | None = None) -> Asset:
+def load_ply(
+    path: Path, companions: Companions, keep_layout: bool = False, crease_angle: float | None = None
+) -> Asset:
     """Read a .ply file. Without normals, edges sharp by ``creases.smooth_by_angle`` are hard.
     ``keep_layout``, ``crease_angle``: see ``asset.load``. Raises InputError."""
     return _Reader(Path(path), companions).asset(keep_layout, crease_angle)
@@ -65,7 +71,11 @@ class _Reader:
             material = Material(name, roughness=0.8, base_color_texture=texture)
             used, faces = np.unique(index[number == k], return_inverse=True)
             own = {n: v[used] for n, v in attributes.items() if n != "colors" or texture is None}
-            meshes.append(Mesh(faces=faces.reshape(-1, 3).astype(np.int32), material=material, name=name, **own))
+            meshes.append(
+                Mesh(
+                    faces=faces.reshape(-1, 3).astype(np.int32), material=material, name=name, **own
+                )
+            )
         if "colors" in attributes and any(t is not None for t in textures):
             self.note("its colours are not drawn where it has a texture")
         settled, origin = settle(meshes, self.note)
@@ -74,7 +84,8 @@ class _Reader:
         return Asset(tuple(settled), self.path.stem, self.companions.notes.lines(), origin=origin)
 
     def _triangles(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """((T, 3) corners, counted over all faces of the file, (T,) the face of each triangle). Sets ``polygons``."""
+        """((T, 3) corners, counted over all faces of the file, (T,) the face of each triangle).
+        Sets ``polygons``."""
         lists = [p.name for p in self.data["face"].properties if hasattr(p, "len_dtype")]
         name = next((n for n in (*_FACES, *lists) if n in lists), None)
         if name is None:
@@ -96,8 +107,9 @@ class _Reader:
         return np.stack([np.asarray(element[n], np.float64) for n in names], axis=1)
 
     def _vertices(self, corners: NDArray, face_of: NDArray) -> tuple[dict[str, NDArray], NDArray]:
-        """(positions, normals, uvs, colors of vertices, as far as there are any, (T, 3) which of them are the
-        triangles' corners). Vertices are split where faces differ in colour or texture coordinates."""
+        """(positions, normals, uvs, colors of vertices, as far as there are any, (T, 3) which of
+        them are the triangles' corners). Vertices are split where faces differ in colour or texture
+        coordinates."""
         index = self.polygons.indices[corners]
         values: dict[str, NDArray] = {"positions": self._positions()}
         normals = self._given(self.vertex, (("nx", "ny", "nz"),))
@@ -126,16 +138,21 @@ class _Reader:
                 values["colors"] = painted[rows[first, -1]]
             index = number.reshape(-1, 3)
         if "uvs" in values:
-            values["uvs"] = values["uvs"] * np.array((1, -1), np.float32) + np.array((0, 1), np.float32)
+            values["uvs"] = values["uvs"] * np.array((1, -1), np.float32) + np.array(
+                (0, 1), np.float32
+            )
         return values, index
 
-    def _given(self, element: Any, choices: tuple[tuple[str, ...], ...]) -> NDArray[np.float64] | None:
+    def _given(
+        self, element: Any, choices: tuple[tuple[str, ...], ...]
+    ) -> NDArray[np.float64] | None:
         there = element.dtype.names or ()
         names = next((c for c in choices if all(n in there for n in c)), None)
         return None if names is None else self._columns(element, names)
 
     def _wedge_uvs(self) -> NDArray[np.float64] | None:
-        """(corners of all faces, 2) texture coordinates of the faces' own, two numbers for each corner."""
+        """(corners of all faces, 2) texture coordinates of the faces' own, two numbers for each
+        corner."""
         if "texcoord" not in (self.face.dtype.names or ()):
             return None
         counts, values = _flat(self.face["texcoord"])
@@ -153,7 +170,9 @@ class _Reader:
         return [self._texture(name) for name in names]
 
     def _texture(self, name: str) -> Texture | None:
-        pixels = self.companions.read(lambda: self.companions.picture(self.companions.find(name, self.path)))
+        pixels = self.companions.read(
+            lambda: self.companions.picture(self.companions.find(name, self.path))
+        )
         if pixels is None:
             return None
         pixels = np.ascontiguousarray(images.to_color(pixels)[..., :3])
@@ -173,7 +192,8 @@ def _distinct(values: NDArray) -> tuple[NDArray, NDArray]:
 
 
 def _decode(element: Any) -> NDArray[np.float32] | None:
-    """(N, 3) linear colours of vertices or faces, which files hold sRGB encoded; None without any."""
+    """(N, 3) linear colours of vertices or faces, which files hold sRGB encoded; None without
+    any."""
     there = element.dtype.names or ()
     names = next((c for c in _COLORS if all(n in there for n in c)), None)
     if names is None:
@@ -204,7 +224,8 @@ def _parse(path: Path) -> Any:
     faces = re.search(r"element\s+face\b(.*?)(element|$)", head, re.DOTALL)
     lists = re.findall(r"property\s+list\s+\S+\s+\S+\s+(\S+)", faces[1]) if faces else []
     try:
-        # lists of known length are read at once; a file of triangles is tried first, then one of quadrilaterals
+        # lists of known length are read at once; a file of triangles is tried first, then one of
+        # quadrilaterals
         for corners in (3, 4) if lists and "ascii" not in head.split("element")[0] else ():
             known = {n: corners * (1 if n in _FACES else 2) for n in lists}
             try:
@@ -214,4 +235,6 @@ def _parse(path: Path) -> Any:
         return plyfile.PlyData.read(str(path))
     except plyfile.PlyParseError as error:
         reason = " ".join(str(error).split())[:160]
-        raise InputError(f"{path}: not a readable PLY file ({reason}); it is damaged or cut short") from None
+        raise InputError(
+            f"{path}: not a readable PLY file ({reason}); it is damaged or cut short"
+        ) from None

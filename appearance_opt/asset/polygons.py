@@ -11,11 +11,12 @@ from numpy.typing import NDArray
 from appearance_opt.asset.normals import accumulate
 
 MOST_CORNERS = 1 << 14
-"""Corners of a face that is not convex: the time to cut ears off one that crosses itself grows with their square."""
+"""Corners of a face that is not convex: the time to cut ears off one that crosses itself grows with
+their square."""
 
 SIMPLE = 64
-"""A face of more corners that is at fewer than half as many places is no polygon, and drawn as a fan: ears would take
-a time that grows with the cube of the corners."""
+"""A face of more corners that is at fewer than half as many places is no polygon, and drawn as a
+fan: ears would take a time that grows with the cube of the corners."""
 
 
 @dataclass(frozen=True)
@@ -34,10 +35,11 @@ class Polygons:
 
 
 def triangulate(polygons: Polygons, points: NDArray) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """(T, 3) positions in ``indices`` and (T,) the face of each triangle, in the order of the faces.
+    """(T, 3) positions in ``indices`` and (T,) the face of each triangle, in the order of the
+    faces.
 
-    Fans from the first corner; where a fan would leave its polygon, which is not convex then, ears are cut instead, in
-    the plane of its mean normal. ``points`` (V, 3): what ``indices`` refer to.
+    Fans from the first corner; where a fan would leave its polygon, which is not convex then, ears
+    are cut instead, in the plane of its mean normal. ``points`` (V, 3): what ``indices`` refer to.
     """
     start = np.cumsum(polygons.counts) - polygons.counts
     fans = np.maximum(polygons.counts - 2, 0)
@@ -60,7 +62,9 @@ def triangulate(polygons: Polygons, points: NDArray) -> tuple[NDArray[np.int64],
         corners = np.arange(start[f], start[f] + polygons.counts[f])
         places = np.asarray(points, np.float64)[polygons.indices[corners]]
         if len(corners) > MOST_CORNERS:
-            raise ValueError(f"a face has {len(corners)} corners, at most {MOST_CORNERS} are supported: triangulate it")
+            raise ValueError(
+                f"a face has {len(corners)} corners, at most {MOST_CORNERS} are supported: triangulate it"
+            )
         if len(corners) > SIMPLE and len(np.unique(places, axis=0)) < len(corners) / 2:
             leaves[f] = False
             continue
@@ -75,9 +79,14 @@ def triangulate(polygons: Polygons, points: NDArray) -> tuple[NDArray[np.int64],
 
 
 def _ears(corners: NDArray[np.float64], normal: NDArray[np.float64]) -> NDArray[np.int64]:
-    """(n, 3) triangles of a polygon with the given ``corners`` (N, 3) and mean normal, wound as it is."""
+    """(n, 3) triangles of a polygon with the given ``corners`` (N, 3) and mean normal, wound as it
+    is."""
     axis = int(np.argmax(np.abs(normal)))
     # two axes in the order in which the polygon runs counterclockwise, as ears do
     axes = [(axis + 1) % 3, (axis + 2) % 3][:: 1 if normal[axis] > 0 else -1]
     flat = np.ascontiguousarray(corners[:, axes])
-    return mapbox_earcut.triangulate_float64(flat, np.array([len(flat)], np.uint32)).astype(np.int64).reshape(-1, 3)
+    return (
+        mapbox_earcut.triangulate_float64(flat, np.array([len(flat)], np.uint32))
+        .astype(np.int64)
+        .reshape(-1, 3)
+    )

@@ -21,8 +21,9 @@ BAND = 1 << 20
 
 @dataclass(frozen=True)
 class Resampled:
-    """Textures under one transform. ``uvs``: (V, 2) of each mesh; ``textures``: by field name; ``what``: what they now
-    share, and what that costs; ``keeps_tangents``: do the meshes' tangents still fit the normal map?"""
+    """Textures under one transform. ``uvs``: (V, 2) of each mesh; ``textures``: by field name;
+    ``what``: what they now share, and what that costs; ``keeps_tangents``: do the meshes' tangents
+    still fit the normal map?"""
 
     uvs: list[NDArray[np.float32]]
     textures: dict[str, Texture]
@@ -31,8 +32,8 @@ class Resampled:
 
 
 def bilinear_grid(texture: Texture, u: NDArray, v: NDArray) -> NDArray:
-    """Stored values (V, U, C) at all pairs of texture coordinates of an upright grid: what ``bilinear`` gives, at the
-    price of copying texels where they are met at their middles."""
+    """Stored values (V, U, C) at all pairs of texture coordinates of an upright grid: what
+    ``bilinear`` gives, at the price of copying texels where they are met at their middles."""
     height, width = texture.pixels.shape[:2]
     out: NDArray | None = None
     for row, down in _taps(v, height, texture.wrap[1]):
@@ -46,8 +47,11 @@ def bilinear_grid(texture: Texture, u: NDArray, v: NDArray) -> NDArray:
     return out
 
 
-def _taps(at: NDArray, size: int, mode: Wrap) -> list[tuple[NDArray[np.int64], NDArray[np.float64]]]:
-    """(numbers of texels, their weights) along one axis: of both neighbours, or of one where none lies between."""
+def _taps(
+    at: NDArray, size: int, mode: Wrap
+) -> list[tuple[NDArray[np.int64], NDArray[np.float64]]]:
+    """(numbers of texels, their weights) along one axis: of both neighbours, or of one where none
+    lies between."""
     # the rounding of a transform there and back must not mix neighbours
     at = np.round(at * size - 0.5, 6)
     corner = np.floor(at)

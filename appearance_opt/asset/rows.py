@@ -10,10 +10,11 @@ _BITS = 62
 
 
 def unique_rows(rows: NDArray) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """(a row of each kind, in lexicographic order; kind of each row) of (N, K) integers, none negative.
+    """(a row of each kind, in lexicographic order; kind of each row) of (N, K) integers, none
+    negative.
 
-    What ``np.unique(rows, axis=0)`` finds in ten times the time, for it compares rows, while here each becomes one
-    number.
+    What ``np.unique(rows, axis=0)`` finds in ten times the time, for it compares rows, while here
+    each becomes one number.
     """
     keys = _keys(rows)
     order = np.argsort(keys)
@@ -29,9 +30,11 @@ def count_unique_rows(rows: NDArray) -> int:
 
 
 def rank_rows(values: NDArray) -> NDArray[np.intp]:
-    """(N, K) the rank of each number of (N, K) among the different ones of its column: integers for ``unique_rows``
-    in the order of the numbers."""
-    return np.stack([np.unique(column, return_inverse=True)[1].ravel() for column in values.T], axis=1)
+    """(N, K) the rank of each number of (N, K) among the different ones of its column: integers for
+    ``unique_rows`` in the order of the numbers."""
+    return np.stack(
+        [np.unique(column, return_inverse=True)[1].ravel() for column in values.T], axis=1
+    )
 
 
 def _keys(rows: NDArray) -> NDArray[np.int64]:

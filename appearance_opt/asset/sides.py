@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     from appearance_opt.asset.types import Material, Mesh
 
 THIN = 1e-3
-"""Volume over area^1.5 of a closed part, below which it is as good as two sheets back to back: a square plate a 350th
-as thick as it is wide. A ball has 0.094."""
+"""Volume over area^1.5 of a closed part, below which it is as good as two sheets back to back: a
+square plate a 350th as thick as it is wide. A ball has 0.094."""
 
 
 def single_sided(meshes: tuple[Mesh, ...]) -> NDArray[np.bool_]:
@@ -37,22 +37,26 @@ def counted(meshes: tuple[Mesh, ...]) -> tuple[int, int]:
 
 
 def apart_from_sides(material: Material) -> tuple:
-    """Equal for materials with equal values and the same textures, whatever the sides: formats whose materials do not
-    know of sides need one for them all."""
+    """Equal for materials with equal values and the same textures, whatever the sides: formats
+    whose materials do not know of sides need one for them all."""
     values = (getattr(material, f.name) for f in fields(material) if f.name != "double_sided")
     return tuple(id(v) if isinstance(v, Texture | Displacement) else v for v in values)
 
 
 def culled(
-    positions: NDArray, faces: NDArray, single: NDArray[np.bool_] | None, passing: NDArray[np.bool_] | None = None
+    positions: NDArray,
+    faces: NDArray,
+    single: NDArray[np.bool_] | None,
+    passing: NDArray[np.bool_] | None = None,
 ) -> NDArray[np.bool_] | None:
-    """(F,) faces that are not to be seen from behind although someone outside might look at their backs; None if there
-    are none, so that nothing has to be done about it.
+    """(F,) faces that are not to be seen from behind although someone outside might look at their
+    backs; None if there are none, so that nothing has to be done about it.
 
-    ``single``: see ``single_sided``; None for none. Of a closed part whose faces look outward nobody sees a back: every
-    edge has two faces that run along it in opposite directions, and its volume is positive (more than ``THIN``). Where
-    such a part passes through itself backs can show; they are drawn. ``passing`` (F,): faces that light passes, through
-    which backs are seen, and which close no part; None for none.
+    ``single``: see ``single_sided``; None for none. Of a closed part whose faces look outward
+    nobody sees a back: every edge has two faces that run along it in opposite directions, and its
+    volume is positive (more than ``THIN``). Where such a part passes through itself backs can show;
+    they are drawn. ``passing`` (F,): faces that light passes, through which backs are seen, and
+    which close no part; None for none.
     """
     if single is None or not single.any():
         return None
@@ -60,7 +64,9 @@ def culled(
     f = place[np.asarray(faces)].astype(np.int64)
     part = connected_parts(f, len(first))
     blocking = np.ones(len(f), bool) if passing is None else ~passing
-    solid = _solid(np.asarray(positions, np.float64)[first], f[blocking], part[blocking], int(part.max()) + 1)
+    solid = _solid(
+        np.asarray(positions, np.float64)[first], f[blocking], part[blocking], int(part.max()) + 1
+    )
     out = single & ~(solid[part] & blocking)
     return out if out.any() else None
 
@@ -73,9 +79,11 @@ def connected_parts(faces: NDArray, vertices: int) -> NDArray[np.int32]:
 
 
 def _solid(positions: NDArray, faces: NDArray, part: NDArray, count: int) -> NDArray[np.bool_]:
-    """By part, of ``count``: is it closed, do its faces look outward, and is there room inside? Faces whose corners
-    coincide are passed over."""
-    proper = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
+    """By part, of ``count``: is it closed, do its faces look outward, and is there room inside?
+    Faces whose corners coincide are passed over."""
+    proper = (
+        (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
+    )
     faces, part = faces[proper], part[proper]
     start, end = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
     low, high = np.minimum(start, end), np.maximum(start, end)

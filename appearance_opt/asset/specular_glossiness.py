@@ -1,8 +1,9 @@
-"""Specular-glossiness materials as metallic-roughness ones (the conversion of Khronos' archived extension
-KHR_materials_pbrSpecularGlossiness, "Converting between workflows").
+"""Specular-glossiness materials as metallic-roughness ones (the conversion of Khronos' archived
+extension KHR_materials_pbrSpecularGlossiness, "Converting between workflows").
 
-Metalness is what makes a dielectric's 4 % and a metal's colour mix to the given specular brightness; the base colour
-follows from diffuse where metalness is low, from specular where it is high.
+Metalness is what makes a dielectric's 4 % and a metal's colour mix to the given specular
+brightness; the base colour follows from diffuse where metalness is low, from specular where it is
+high.
 """
 
 from __future__ import annotations
@@ -26,8 +27,8 @@ _BRIGHTNESS = np.array([0.299, 0.587, 0.114], np.float32)
 
 @dataclass(frozen=True)
 class Specular:
-    """A material as the extension gives it. ``diffuse``, ``specular``: linear RGB factors; ``specular_texture``: sRGB
-    specular colour, and glossiness as alpha."""
+    """A material as the extension gives it. ``diffuse``, ``specular``: linear RGB factors;
+    ``specular_texture``: sRGB specular colour, and glossiness as alpha."""
 
     diffuse: tuple[float, float, float] = (1.0, 1.0, 1.0)
     specular: tuple[float, float, float] = (1.0, 1.0, 1.0)
@@ -36,7 +37,9 @@ class Specular:
     specular_texture: Texture | None = None
 
 
-def metallic(diffuse: NDArray, specular: NDArray) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def metallic(
+    diffuse: NDArray, specular: NDArray
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """(base colour (..., 3), metalness (...)) of linear diffuse and specular colours (..., 3)."""
     share = 1 - specular.max(axis=-1)
     metalness = _metalness(_brightness(diffuse), _brightness(specular), share)
@@ -60,16 +63,24 @@ def _metalness(diffuse: NDArray, specular: NDArray, share: NDArray) -> NDArray:
 
 def constants(material: Specular) -> tuple[tuple[float, float, float], float, float]:
     """(base colour, roughness, metalness) of a material without textures."""
-    base, metalness = metallic(np.array(material.diffuse, np.float32), np.array(material.specular, np.float32))
-    return (float(base[0]), float(base[1]), float(base[2])), 1 - material.glossiness, float(metalness)
+    base, metalness = metallic(
+        np.array(material.diffuse, np.float32), np.array(material.specular, np.float32)
+    )
+    return (
+        (float(base[0]), float(base[1]), float(base[2])),
+        1 - material.glossiness,
+        float(metalness),
+    )
 
 
 def textures(material: Specular) -> tuple[Texture, Texture]:
-    """(base colour, ORM) textures, 8 bits, of a material with at least one texture; they hold its factors, too. The
-    diffuse texture's alpha becomes that of the base colour."""
+    """(base colour, ORM) textures, 8 bits, of a material with at least one texture; they hold its
+    factors, too. The diffuse texture's alpha becomes that of the base colour."""
     given = [t for t in (material.diffuse_texture, material.specular_texture) if t is not None]
     height, width = (max(t.pixels.shape[k] for t in given) for k in (0, 1))
-    has_alpha = material.diffuse_texture is not None and material.diffuse_texture.pixels.shape[2] == 4
+    has_alpha = (
+        material.diffuse_texture is not None and material.diffuse_texture.pixels.shape[2] == 4
+    )
     base = np.empty((height, width, 4 if has_alpha else 3), np.uint8)
     orm = np.full((height, width, 3), 255, np.uint8)
     # textures of different sizes are brought to the larger one, each as a whole
@@ -80,7 +91,9 @@ def textures(material: Specular) -> tuple[Texture, Texture]:
     for row in range(0, height, ROWS):
         band = slice(row, row + ROWS)
         diffuse, specular = (
-            np.ones((1, 1, 4), np.float32) if t is None else _rgba(Texture(t.pixels[band], t.color_space))
+            np.ones((1, 1, 4), np.float32)
+            if t is None
+            else _rgba(Texture(t.pixels[band], t.color_space))
             for t in whole
         )
         color, metalness = metallic(
@@ -90,7 +103,9 @@ def textures(material: Specular) -> tuple[Texture, Texture]:
         base[band, :, :3] = np.round(255 * linear_to_srgb(color))
         if has_alpha:
             base[band, :, 3] = np.round(255 * diffuse[..., 3])
-        orm[band, :, 1] = np.round(255 * np.clip(1 - specular[..., 3] * np.float32(material.glossiness), 0, 1))
+        orm[band, :, 1] = np.round(
+            255 * np.clip(1 - specular[..., 3] * np.float32(material.glossiness), 0, 1)
+        )
         orm[band, :, 2] = np.round(255 * metalness)
     return Texture(base, "srgb", given[0].wrap), Texture(orm, "linear", given[0].wrap)
 
@@ -98,7 +113,11 @@ def textures(material: Specular) -> tuple[Texture, Texture]:
 def _rgba(texture: Texture) -> NDArray[np.float32]:
     """Linear pixels (H, W, 4); alpha is 1 without one."""
     pixels = texture.linear()
-    return pixels if pixels.shape[2] == 4 else np.concatenate([pixels, np.ones_like(pixels[..., :1])], axis=2)
+    return (
+        pixels
+        if pixels.shape[2] == 4
+        else np.concatenate([pixels, np.ones_like(pixels[..., :1])], axis=2)
+    )
 
 
 def _enlarge(texture: Texture, height: int, width: int) -> Texture:

@@ -30,8 +30,8 @@ _OWN = 1 << 15
 
 
 def load_stl(path: Path, keep_layout: bool = False, crease_angle: float | None = None) -> Asset:
-    """Read an STL file: vertices at one place are one, edges sharp by ``creases.smooth_by_angle`` are
-    hard. ``keep_layout``, ``crease_angle``: see ``asset.load``. Raises InputError."""
+    """Read an STL file: vertices at one place are one, edges sharp by ``creases.smooth_by_angle``
+    are hard. ``keep_layout``, ``crease_angle``: see ``asset.load``. Raises InputError."""
     path = Path(path)
     data = read_bytes(path)
     notes = ["no material in this format: a default one is used"]
@@ -52,7 +52,13 @@ def load_stl(path: Path, keep_layout: bool = False, crease_angle: float | None =
         positions, faces = positions[pair // len(values)], new.reshape(-1, 3)
         vertex_colors = srgb_to_linear(values.astype(np.float32))[pair % len(values)]
     material = Material(name=path.stem, roughness=0.8)
-    mesh = Mesh(positions, faces.astype(np.int32), colors=vertex_colors, material=material, name=path.stem)  # type: ignore[arg-type]
+    mesh = Mesh(
+        positions,  # type: ignore[arg-type]
+        faces.astype(np.int32),
+        colors=vertex_colors,
+        material=material,
+        name=path.stem,
+    )
     meshes, origin = settle([mesh], notes.append)
     if not keep_layout:
         meshes = add_normals(meshes, crease_angle=crease_angle)
@@ -67,12 +73,16 @@ def _facets(data: bytes, path: Path, note: Callable[[str], None]) -> NDArray | N
     if len(data) < _HEAD or (_is_text(data) and (count != there or rest)):
         return None
     if count > there:
-        raise InputError(f"{path}: the STL file is cut short, or is none: {there} of {count} facets are there")
+        raise InputError(
+            f"{path}: the STL file is cut short, or is none: {there} of {count} facets are there"
+        )
     if count == 0 and there:
         note(f"its number of facets is 0: all {there} are read")
         count = there
     elif count != there or rest:
-        note(f"{len(data) - _HEAD - count * _FACET.itemsize} bytes behind its {count} facets are ignored")
+        note(
+            f"{len(data) - _HEAD - count * _FACET.itemsize} bytes behind its {count} facets are ignored"
+        )
     return np.frombuffer(data, _FACET, count, _HEAD)
 
 
@@ -96,13 +106,14 @@ def _from_text(data: bytes, path: Path) -> NDArray[np.float64]:
 def facet_colors(
     header: bytes, attribute: NDArray[np.uint16], note: Callable[[str], None]
 ) -> NDArray[np.float64] | None:
-    """(F, 3) colours of the facets of a binary file, encoded as sRGB, from their ``attribute`` (F,); None
-    if they have none. ``header``: of 80 bytes.
+    """(F, 3) colours of the facets of a binary file, encoded as sRGB, from their ``attribute``
+    (F,); None if they have none. ``header``: of 80 bytes.
 
-    Two conventions have five bits for each channel. Materialise Magics writes ``COLOR=`` and four bytes
-    of red, green, blue and alpha into the header: the colour of the facets whose highest bit is set;
-    the others have their own, red in the lowest bits. VisCAM and SolidView write no such header; a
-    facet has a colour, blue in the lowest bits, if its highest bit is set, and is white otherwise.
+    Two conventions have five bits for each channel. Materialise Magics writes ``COLOR=`` and four
+    bytes of red, green, blue and alpha into the header: the colour of the facets whose highest bit
+    is set; the others have their own, red in the lowest bits. VisCAM and SolidView write no such
+    header; a facet has a colour, blue in the lowest bits, if its highest bit is set, and is white
+    otherwise.
     """
     bits = attribute.astype(np.int64)
     at = header.find(b"COLOR=")

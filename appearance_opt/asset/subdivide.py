@@ -1,8 +1,8 @@
 """Subdivision surfaces: Catmull-Clark refinement (Catmull and Clark 1978), vectorised.
 
-Boundaries follow their own cubic curve; corners of the boundary (one face) stay. Creases and corners may be semi-sharp
-(DeRose, Kass and Truong 1998): each level takes 1 off their sharpness, below 1 rules are blended. Vertices lie on the
-refined mesh, not on the limit surface.
+Boundaries follow their own cubic curve; corners of the boundary (one face) stay. Creases and
+corners may be semi-sharp (DeRose, Kass and Truong 1998): each level takes 1 off their sharpness,
+below 1 rules are blended. Vertices lie on the refined mesh, not on the limit surface.
 """
 
 from __future__ import annotations
@@ -18,7 +18,8 @@ from appearance_opt.asset.polygons import Polygons
 
 @dataclass(frozen=True)
 class Sharpness:
-    """For how many levels edges and vertices stay sharp: ``edge`` (E,) of the ``edges`` (E, 2), ``corner`` (V,)."""
+    """For how many levels edges and vertices stay sharp: ``edge`` (E,) of the ``edges`` (E, 2),
+    ``corner`` (V,)."""
 
     edges: NDArray[np.int64]
     edge: NDArray[np.float64]
@@ -30,9 +31,12 @@ class Sharpness:
         return cls(np.empty((0, 2), np.int64), np.empty(0), np.zeros(vertices))
 
     def of(self, keys: NDArray[np.int64], vertices: int) -> NDArray[np.float64]:
-        """Sharpness of edges, whose ``keys`` (lower vertex times ``vertices`` plus higher one) are in order."""
+        """Sharpness of edges, whose ``keys`` (lower vertex times ``vertices`` plus higher one) are
+        in order."""
         out = np.zeros(len(keys))
-        own = self.edges.min(axis=1, initial=vertices) * vertices + self.edges.max(axis=1, initial=0)
+        own = self.edges.min(axis=1, initial=vertices) * vertices + self.edges.max(
+            axis=1, initial=0
+        )
         at = np.searchsorted(keys, own)
         there = (at < len(keys)) & (keys[np.minimum(at, len(keys) - 1)] == own)
         np.maximum.at(out, at[there], self.edge[there])
@@ -42,8 +46,9 @@ class Sharpness:
 def catmull_clark(
     values: NDArray, polygons: Polygons, pinned_boundary: bool, sharpness: Sharpness | None = None
 ) -> tuple[NDArray, Polygons, Sharpness]:
-    """One level: values (V, k) of vertices, the quads of the refined mesh, and what is still sharp of it.
-    ``pinned_boundary`` keeps boundary vertices where they are (texture coordinates: seams stay put)."""
+    """One level: values (V, k) of vertices, the quads of the refined mesh, and what is still sharp
+    of it. ``pinned_boundary`` keeps boundary vertices where they are (texture coordinates: seams
+    stay put)."""
     n, faces = len(values), len(polygons.counts)
     sharpness = Sharpness.none(n) if sharpness is None else sharpness
     face_of = np.repeat(np.arange(faces), polygons.counts)
@@ -68,12 +73,17 @@ def catmull_clark(
     previous[polygons.next()] = edge_of
     quads = np.stack([corner, n + edge_of, n + len(keys) + face_of, n + previous], axis=1)
     refined = Polygons(np.full(len(quads), 4), quads.ravel())
-    return np.concatenate([moved, edge_point, centre]), refined, _next_sharpness(sharpness.corner, ends, creased, faces)
+    return (
+        np.concatenate([moved, edge_point, centre]),
+        refined,
+        _next_sharpness(sharpness.corner, ends, creased, faces),
+    )
 
 
 @dataclass(frozen=True)
 class _Rim:
-    """Edges: their ends (E, 2) and middles, which lie on the ``boundary``, and how sharp each is, 0 to 1."""
+    """Edges: their ends (E, 2) and middles, which lie on the ``boundary``, and how sharp each is, 0
+    to 1."""
 
     ends: NDArray
     middle: NDArray
@@ -82,7 +92,12 @@ class _Rim:
 
 
 def _vertex_points(
-    values: NDArray, corner: NDArray, centre: NDArray, rim: _Rim, corner_sharpness: NDArray, pinned_boundary: bool
+    values: NDArray,
+    corner: NDArray,
+    centre: NDArray,
+    rim: _Rim,
+    corner_sharpness: NDArray,
+    pinned_boundary: bool,
 ) -> NDArray:
     """Where the vertices go. ``centre``: of the face of each ``corner``."""
     n, ends = len(values), rim.ends
@@ -96,7 +111,9 @@ def _vertex_points(
         accumulate(along, ends[sharp, k], rim.middle[sharp])
     on_rim = np.bincount(ends[rim.boundary].ravel(), minlength=n)[:, None] > 0
     creases = np.bincount(ends[sharp].ravel(), minlength=n)[:, None]
-    shares = np.bincount(ends.ravel(), np.repeat(rim.share, 2), minlength=n)[:, None] / np.maximum(creases, 1)
+    shares = np.bincount(ends.ravel(), np.repeat(rim.share, 2), minlength=n)[:, None] / np.maximum(
+        creases, 1
+    )
     f, e = np.maximum(faces_around, 1), np.maximum(valence, 1)
     smooth = (mean_face / f + 2 * mean_edge / e + (valence - 3) * values) / e
     curve = np.where((creases == 2) & (faces_around > 1), (along / 2 + values) / 2, values)

@@ -9,15 +9,19 @@ from appearance_opt.asset.normals import accumulate, apart, corner_angle, unit
 
 
 def split_and_tangents(
-    positions: NDArray, normals: NDArray, uvs: NDArray, faces: NDArray, mesh_of: NDArray | None = None
+    positions: NDArray,
+    normals: NDArray,
+    uvs: NDArray,
+    faces: NDArray,
+    mesh_of: NDArray | None = None,
 ) -> tuple[NDArray[np.intp], NDArray[np.int32], NDArray[np.float32]]:
-    """Tangents of a mesh with texture coordinates; or of several in common arrays, where ``mesh_of`` (V,)
-    says which vertex belongs to which.
+    """Tangents of a mesh with texture coordinates; or of several in common arrays, where
+    ``mesh_of`` (V,) says which vertex belongs to which.
 
     Per face corner, the direction of growing u is projected on the plane of the vertex normal,
     normalised, weighted by the corner's angle in that plane and summed over the corners that share
-    position, normal, UV and handedness. Vertices whose corners differ in handedness (a mirrored UV seam
-    through them) are split.
+    position, normal, UV and handedness. Vertices whose corners differ in handedness (a mirrored UV
+    seam through them) are split.
 
     Returns (vertex_index (R,): input vertex of each output vertex; faces (F, 3); tangents (R, 4)).
     Faces without UV area inherit from their neighbours; a vertex with no usable face gets some unit
@@ -27,7 +31,9 @@ def split_and_tangents(
     vertex_index, new_faces = _split(faces, mirrored, len(positions))
     n = np.asarray(normals, np.float64)[vertex_index]
     own = None if mesh_of is None else mesh_of[vertex_index]
-    group, groups = _groups(positions[vertex_index], normals[vertex_index], uvs[vertex_index], new_faces, mirrored, own)
+    group, groups = _groups(
+        positions[vertex_index], normals[vertex_index], uvs[vertex_index], new_faces, mirrored, own
+    )
     p = np.asarray(positions, np.float64)
     total = np.zeros((groups, 3))
     for k in range(3):
@@ -42,7 +48,11 @@ def split_and_tangents(
     sign = np.ones(len(vertex_index))
     # v grows downward: a mapping that is not mirrored has its bitangent against growing v
     sign[new_faces.ravel()] = np.repeat(np.where(mirrored, -1.0, 1.0), 3)
-    return vertex_index, new_faces, np.concatenate([tangents, sign[:, None]], axis=1).astype(np.float32)
+    return (
+        vertex_index,
+        new_faces,
+        np.concatenate([tangents, sign[:, None]], axis=1).astype(np.float32),
+    )
 
 
 def any_tangent(normals: NDArray) -> NDArray:
@@ -61,7 +71,9 @@ def _per_face(positions: NDArray, uvs: NDArray, faces: NDArray) -> tuple[NDArray
     return determinant > 0, np.abs(determinant) > 1e-20, along_u
 
 
-def _split(faces: NDArray, mirrored: NDArray, count: int) -> tuple[NDArray[np.intp], NDArray[np.int32]]:
+def _split(
+    faces: NDArray, mirrored: NDArray, count: int
+) -> tuple[NDArray[np.intp], NDArray[np.int32]]:
     """Vertices duplicated where faces of both handednesses meet."""
     key = faces.astype(np.int64) * 2 + mirrored[:, None]
     used, new = np.unique(key, return_inverse=True)

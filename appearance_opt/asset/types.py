@@ -73,8 +73,8 @@ class Displacement:
 
 @dataclass(frozen=True)
 class Volume:
-    """What light passes through inside of a transmissive object (glTF 2.0's KHR_materials_volume, whose units are
-    metres): carried over, drawn by no renderer here."""
+    """What light passes through inside of a transmissive object (glTF 2.0's KHR_materials_volume,
+    whose units are metres): carried over, drawn by no renderer here."""
 
     thickness: float = 0.0
     attenuation_distance: float = float("inf")
@@ -85,17 +85,20 @@ class Volume:
 class Material:
     """glTF 2.0 metallic-roughness material (what a texture gives is multiplied by its factor).
 
-    ``base_color``: linear RGB factor. ``orm_texture``: R occlusion (not used by the renderer; written as
-    occlusion if ``has_occlusion``), G roughness, B metalness, as glTF packs them. ``displacement`` is
-    written where a format has it; no renderer here reads it. ``emission``: linear RGB factor, may exceed 1, and its
-    sRGB texture: carried over, drawn by no renderer here, for it does not depend on any light.
+    ``base_color``: linear RGB factor. ``orm_texture``: R occlusion (not used by the renderer;
+    written as occlusion if ``has_occlusion``), G roughness, B metalness, as glTF packs them.
+    ``displacement`` is written where a format has it; no renderer here reads it. ``emission``:
+    linear RGB factor, may exceed 1, and its sRGB texture: carried over, drawn by no renderer here,
+    for it does not depend on any light.
 
-    Alpha is ``opacity`` times the fourth channels of ``base_color_texture`` and of vertex colours. It means nothing
-    with the ``alpha_mode`` "opaque"; with "mask" the surface is there where alpha is at least ``alpha_cutoff``; with
-    "blend" alpha is its coverage. ``transmission``: share of the light that passes through (times the red channel of
-    its texture); ``ior``, ``volume`` and the green channel of ``thickness_texture`` are carried over beside it.
+    Alpha is ``opacity`` times the fourth channels of ``base_color_texture`` and of vertex colours.
+    It means nothing with the ``alpha_mode`` "opaque"; with "mask" the surface is there where alpha
+    is at least ``alpha_cutoff``; with "blend" alpha is its coverage. ``transmission``: share of the
+    light that passes through (times the red channel of its texture); ``ior``, ``volume`` and the
+    green channel of ``thickness_texture`` are carried over beside it.
 
-    ``unlit``: shown in its base colour whatever the light, as if it were a picture of itself (KHR_materials_unlit).
+    ``unlit``: shown in its base colour whatever the light, as if it were a picture of itself
+    (KHR_materials_unlit).
     """
 
     name: str = "material"
@@ -148,8 +151,8 @@ class Mesh:
 
 @dataclass(frozen=True)
 class Contents:
-    """Names of what a file holds beside its surfaces, and no job here uses: ``skins`` (in USD skeletons), ``clips`` of
-    animation, ``variants`` as ``--variant`` takes them."""
+    """Names of what a file holds beside its surfaces, and no job here uses: ``skins`` (in USD
+    skeletons), ``clips`` of animation, ``variants`` as ``--variant`` takes them."""
 
     skins: tuple[str, ...] = ()
     clips: tuple[str, ...] = ()
@@ -175,8 +178,11 @@ class Asset:
         return sum(len(m.faces) for m in self.meshes)
 
     def bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Corners (3,), (3,) of the axis-aligned box around all referenced vertices, in the world."""
-        used = [m.positions[_marked(m.faces, len(m.positions))] for m in self.meshes if len(m.faces)]
+        """Corners (3,), (3,) of the axis-aligned box around all referenced vertices, in the
+        world."""
+        used = [
+            m.positions[_marked(m.faces, len(m.positions))] for m in self.meshes if len(m.faces)
+        ]
         low = np.min([p.min(axis=0) for p in used], axis=0).astype(np.float64)
         high = np.max([p.max(axis=0) for p in used], axis=0).astype(np.float64)
         return low + self.origin, high + self.origin
@@ -195,9 +201,13 @@ def _marked(indices: NDArray, count: int) -> NDArray[np.bool_]:
 
 def srgb_to_linear(x: NDArray) -> NDArray:
     """IEC 61966-2-1 decoding of values in [0, 1] (any shape)."""
-    return np.where(x <= 0.04045, x / 12.92, ((np.maximum(x, 0.0) + 0.055) / 1.055) ** 2.4).astype(x.dtype)
+    return np.where(x <= 0.04045, x / 12.92, ((np.maximum(x, 0.0) + 0.055) / 1.055) ** 2.4).astype(
+        x.dtype
+    )
 
 
 def linear_to_srgb(x: NDArray) -> NDArray:
     """IEC 61966-2-1 encoding of linear values in [0, 1] (any shape)."""
-    return np.where(x <= 0.0031308, x * 12.92, 1.055 * np.maximum(x, 1e-12) ** (1 / 2.4) - 0.055).astype(x.dtype)
+    return np.where(
+        x <= 0.0031308, x * 12.92, 1.055 * np.maximum(x, 1e-12) ** (1 / 2.4) - 0.055
+    ).astype(x.dtype)

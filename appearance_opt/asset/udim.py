@@ -1,9 +1,9 @@
 """Textures in tiles, one file for each unit square of the texture coordinates.
 
-The name of such a texture holds ``<UDIM>``, which stands for 1001 + column + 10 * row, counted from the lower left
-square, ten to a row, or ``<UVTILE>``, for ``u<column + 1>_v<row + 1>`` (MaterialX specification, "Filename
-Substitutions"). Here each tile that faces lie on becomes a material of its own, and the meshes are taken apart along
-the tiles, which faces do not cross: nothing is resampled.
+The name of such a texture holds ``<UDIM>``, which stands for 1001 + column + 10 * row, counted from
+the lower left square, ten to a row, or ``<UVTILE>``, for ``u<column + 1>_v<row + 1>`` (MaterialX
+specification, "Filename Substitutions"). Here each tile that faces lie on becomes a material of its
+own, and the meshes are taken apart along the tiles, which faces do not cross: nothing is resampled.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ FIRST, COLUMNS = 1001, 10
 MAX_ROWS = 899  # 1001 to 9990
 
 MAX_TEXELS = 1 << 26
-"""Texels of all tiles of a texture at most: four times 4096 x 4096. More tiles are read at a half, a third ... of their
-size."""
+"""Texels of all tiles of a texture at most: four times 4096 x 4096. More tiles are read at a half,
+a third ... of their size."""
 
 CROSSING = 1e-3
 """How far a face may reach into the next tile without being counted as one that crosses."""
@@ -44,7 +44,8 @@ _TOKEN = re.compile("<(UDIM|UVTILE)>", re.IGNORECASE)
 
 @dataclass(frozen=True)
 class Tile:
-    """``number``: as in names with ``<UDIM>``; ``texels``: those that each texture may have there."""
+    """``number``: as in names with ``<UDIM>``; ``texels``: those that each texture may have
+    there."""
 
     number: int
     texels: int
@@ -58,14 +59,23 @@ def is_tiled(name: str) -> bool:
 def tile_name(name: str, number: int) -> str:
     """The name of one of them."""
     row, column = divmod(number - FIRST, COLUMNS)
-    return _TOKEN.sub(lambda m: str(number) if m[1].upper() == "UDIM" else f"u{column + 1}_v{row + 1}", unquote(name))
+    return _TOKEN.sub(
+        lambda m: str(number) if m[1].upper() == "UDIM" else f"u{column + 1}_v{row + 1}",
+        unquote(name),
+    )
 
 
 def read_tile(
-    name: str, tile: Tile, owner: Path, companions: Companions, read: Callable[[str], NDArray], found: bool = False
+    name: str,
+    tile: Tile,
+    owner: Path,
+    companions: Companions,
+    read: Callable[[str], NDArray],
+    found: bool = False,
 ) -> NDArray | None:
-    """Pixels of a tile, as ``read`` reads the file of a name; None, with a note, if it is missing among others.
-    ``found``: is it known that there are any? None at all is a missing texture as any other. Raises InputError."""
+    """Pixels of a tile, as ``read`` reads the file of a name; None, with a note, if it is missing
+    among others. ``found``: is it known that there are any? None at all is a missing texture as any
+    other. Raises InputError."""
     file = tile_name(name, tile.number)
     try:
         return read(file)
@@ -85,18 +95,22 @@ def _raise(error: Exception) -> NDArray:
 
 def _any_tile(name: str, owner: Path) -> bool:
     path = owner.resolve().parent / unquote(name).replace("\\", "/")
-    pattern = re.escape(path.name.lower()).replace("<udim>", r"\d{4}").replace("<uvtile>", r"u\d+_v\d+")
+    pattern = (
+        re.escape(path.name.lower()).replace("<udim>", r"\d{4}").replace("<uvtile>", r"u\d+_v\d+")
+    )
     folders = {path.parent, owner.resolve().parent}
     names = (f.name.lower() for folder in folders if folder.is_dir() for f in folder.iterdir())
     return any(re.fullmatch(pattern, n) for n in names)
 
 
 def fit_to_tile(texture: Texture, tile: Tile, companions: Companions) -> Texture:
-    """A tile's texture at a half, a third ... of its size, as means of linear values, so that it has no more texels
-    than it may; it ends at its edge. ``note`` is told."""
+    """A tile's texture at a half, a third ... of its size, as means of linear values, so that it
+    has no more texels than it may; it ends at its edge. ``note`` is told."""
     texture = replace(texture, wrap=("clamp", "clamp"))
     height, width, channels = texture.pixels.shape
-    step = next(k for k in range(1, height * width + 1) if (height // k) * (width // k) <= tile.texels)
+    step = next(
+        k for k in range(1, height * width + 1) if (height // k) * (width // k) <= tile.texels
+    )
     step = min(step, height, width)
     if step == 1:
         return texture
@@ -107,7 +121,9 @@ def fit_to_tile(texture: Texture, tile: Tile, companions: Companions) -> Texture
     rows, columns = height // step, width // step
     companions.budget.give_back_picture(width, height, bytes_per_texel)
     companions.budget.take_picture(columns, rows, bytes_per_texel, "tiles")
-    blocks = texture.linear()[: rows * step, : columns * step].reshape(rows, step, columns, step, channels)
+    blocks = texture.linear()[: rows * step, : columns * step].reshape(
+        rows, step, columns, step, channels
+    )
     means = blocks.mean(axis=(1, 3), dtype=np.float32)
     if texture.pixels.dtype.kind == "f":
         return replace(texture, pixels=means, color_space="linear")
@@ -125,9 +141,9 @@ def split(
 ) -> list[Mesh]:
     """The meshes, those whose material is in ``readers`` (by ``id``) taken apart into their tiles.
 
-    ``readers`` read the material of a tile. ``transforms_of``: by ``id`` of a material, where its textures read
-    (``uv_unification.unify``); for the tiles' materials, which ``readers`` put there, it is moved to
-    their unit squares.
+    ``readers`` read the material of a tile. ``transforms_of``: by ``id`` of a material, where its
+    textures read (``uv_unification.unify``); for the tiles' materials, which ``readers`` put there,
+    it is moved to their unit squares.
     """
     tiles = {k: _tiles(m, next(iter(transforms_of[id(m.material)].values()))) for k, m in enumerate(meshes)
              if id(m.material) in readers and m.uvs is not None}  # fmt: skip
@@ -151,17 +167,27 @@ def split(
                     materials[key] = readers[key[0]](Tile(number, MAX_TEXELS // len(used[key[0]])))
                     _move(transforms_of[id(materials[key])], number)
             part = _part(mesh, tile == number)
-            out.append(replace(part, material=materials[key], name=f"{mesh.name}.{number}" if number else mesh.name))
+            out.append(
+                replace(
+                    part,
+                    material=materials[key],
+                    name=f"{mesh.name}.{number}" if number else mesh.name,
+                )
+            )
     for name, count in crossing.items():
         if count:
-            note(f"material '{name}': {count} faces cross the border of a tile: the tile of their middle is taken")
+            note(
+                f"material '{name}': {count} faces cross the border of a tile: the tile of their middle is taken"
+            )
     return out
 
 
 def _tiles(mesh: Mesh, transform: UvTransform) -> tuple[NDArray[np.int64], int]:
     """(the tile of each face, 0 outside of all; how many faces cross a border)."""
     uvs = transform.of(np.asarray(mesh.uvs, np.float64))
-    inside = np.asarray(((mesh.faces >= 0) & (mesh.faces < len(uvs))).all(axis=1))  # the rest is for ``repair``
+    inside = np.asarray(
+        ((mesh.faces >= 0) & (mesh.faces < len(uvs))).all(axis=1)
+    )  # the rest is for ``repair``
     corners = uvs[np.where(inside[:, None], mesh.faces, 0)]
     corners = np.stack([corners[..., 0], 1 - corners[..., 1]], axis=-1)
     with np.errstate(invalid="ignore"):
@@ -174,7 +200,8 @@ def _tiles(mesh: Mesh, transform: UvTransform) -> tuple[NDArray[np.int64], int]:
 
 
 def _move(transforms: dict[str, UvTransform], tile: int) -> None:
-    """Move where textures read from a tile to the unit square; v counts downward here, tiles upward."""
+    """Move where textures read from a tile to the unit square; v counts downward here, tiles
+    upward."""
     row, column = divmod(tile - FIRST, COLUMNS)
     for name, transform in transforms.items():
         matrix = transform.matrix.copy()
@@ -188,7 +215,11 @@ def _part(mesh: Mesh, chosen: NDArray) -> Mesh:
     inside = np.unique(faces[(faces >= 0) & (faces < len(mesh.positions))])
     number = np.full(len(mesh.positions) + 1, -1, np.int64)
     number[inside] = np.arange(len(inside))
-    faces = np.where((faces >= 0) & (faces < len(mesh.positions)), number[np.clip(faces, 0, len(number) - 1)], faces)
+    faces = np.where(
+        (faces >= 0) & (faces < len(mesh.positions)),
+        number[np.clip(faces, 0, len(number) - 1)],
+        faces,
+    )
 
     def of(values: NDArray | None) -> NDArray | None:
         return None if values is None else values[inside]

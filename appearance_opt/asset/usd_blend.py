@@ -10,10 +10,12 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 
-def blend_shapes(prim: Any, points: NDArray) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
-    """((V, 3) points, (V, 3) what is added to the normals of these points) of a mesh with blend shapes;
-    None without any. Weights are those that the animation of its skeleton has apart from its time samples
-    (UsdSkelAnimation, "Blend Shapes"), which are animation, and zero otherwise."""
+def blend_shapes(
+    prim: Any, points: NDArray
+) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+    """((V, 3) points, (V, 3) what is added to the normals of these points) of a mesh with blend
+    shapes; None without any. Weights are those that the animation of its skeleton has apart from
+    its time samples (UsdSkelAnimation, "Blend Shapes"), which are animation, and zero otherwise."""
     from pxr import UsdSkel, Vt
 
     binding = UsdSkel.BindingAPI(prim)
@@ -26,7 +28,9 @@ def blend_shapes(prim: Any, points: NDArray) -> tuple[NDArray[np.float64], NDArr
     if not any(weights):
         return points, turned
     moved = Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(points, np.float32))
-    of_shapes = query.ComputeSubShapeWeights(Vt.FloatArray(weights))  # in-between shapes have their share
+    of_shapes = query.ComputeSubShapeWeights(
+        Vt.FloatArray(weights)
+    )  # in-between shapes have their share
     indices, offsets = query.ComputeBlendShapePointIndices(), query.ComputeSubShapePointOffsets()
     query.ComputeDeformedPoints(*of_shapes, indices, offsets, moved)
     for k, weight in enumerate(weights):

@@ -44,9 +44,12 @@ class MaterialReader:
         self.stage, self.path, self.companions, self.note = stage, path, companions, companions.note
         self._materials: dict[str, Material] = {}
         self.transforms: dict[int, dict[str, uv_transforms.UvTransform]] = {}
-        self._sets: dict[int, tuple[str, ...]] = {}  # by id of a material, the primvars that its textures read
+        self._sets: dict[
+            int, tuple[str, ...]
+        ] = {}  # by id of a material, the primvars that its textures read
         self.tiles: dict[int, Callable[[Tile], Material]] = {}
-        # while a material is read: the tile of its textures that is asked for, and whether it has any in tiles
+        # while a material is read: the tile of its textures that is asked for, and whether it has
+        # any in tiles
         self._tile: Tile | None = None
         self._in_tiles = False
         self._pixels: dict[str, NDArray] = {}
@@ -55,8 +58,9 @@ class MaterialReader:
     def bindings(
         self, prim: Any, face_ids: NDArray, covers_in_part: bool = False
     ) -> Iterator[tuple[Material, list[str], NDArray[np.bool_]]]:
-        """(material, primvars of the texture coordinates that it reads, mask of the triangles that wear it);
-        ``face_ids``: face of the file of each triangle. ``covers_in_part``: does the mesh's displayOpacity say so?"""
+        """(material, primvars of the texture coordinates that it reads, mask of the triangles that
+        wear it); ``face_ids``: face of the file of each triangle. ``covers_in_part``: does the
+        mesh's displayOpacity say so?"""
         from pxr import UsdGeom
 
         double = bool(UsdGeom.Gprim(prim).GetDoubleSidedAttr().Get())
@@ -72,19 +76,24 @@ class MaterialReader:
             yield material, self._uv_names(prim, prim), rest
 
     def uv_names(self, prim: Any) -> list[str]:
-        """The primvars that hold texture coordinates of a mesh, of which each of its materials reads some."""
+        """The primvars that hold texture coordinates of a mesh, of which each of its materials
+        reads some."""
         subsets = self._subsets(prim)
         wearers = [*subsets, *([prim] if not subsets or self._bound_prim(prim) else [])]
         names = list(dict.fromkeys(name for w in wearers for name in self._uv_names(prim, w)))
         if len(names) > 1 and len(wearers) > 1:
-            self.note(f"'{prim.GetPath()}': its materials read texture coordinates of their own ({', '.join(names)})")
+            self.note(
+                f"'{prim.GetPath()}': its materials read texture coordinates of their own ({', '.join(names)})"
+            )
         return names
 
     def bound_keys(self, prim: Any) -> tuple[str, ...]:
         """What tells the materials of a mesh and its subsets from those of others."""
         wearers = (prim, *self._subsets(prim))
         bound = ((w, self._bound_prim(w)) for w in wearers)
-        return tuple(_key(material) if material else self._unresolved(w) or "" for w, material in bound)
+        return tuple(
+            _key(material) if material else self._unresolved(w) or "" for w, material in bound
+        )
 
     def _subsets(self, prim: Any) -> list[Any]:
         from pxr import UsdShade
@@ -92,8 +101,8 @@ class MaterialReader:
         return [s.GetPrim() for s in UsdShade.MaterialBindingAPI(prim).GetMaterialBindSubsets()]
 
     def _uv_names(self, prim: Any, wearer: Any) -> list[str]:
-        """The primvars that the material of ``wearer``, a mesh or a subset of it, reads, in the order of its sets; the
-        usual one for each that the mesh does not have."""
+        """The primvars that the material of ``wearer``, a mesh or a subset of it, reads, in the
+        order of its sets; the usual one for each that the mesh does not have."""
         from pxr import UsdGeom
 
         api = UsdGeom.PrimvarsAPI(prim)
@@ -112,17 +121,23 @@ class MaterialReader:
         return any(r and _reads_primvar(r, name) for r in readers)
 
     def _on_mesh(self, material: Material, double: bool, covers_in_part: bool) -> Material:
-        """The material with what in USD the mesh says: are both sides of it seen, or one, and does it
-        cover what lies behind it in part?"""
+        """The material with what in USD the mesh says: are both sides of it seen, or one, and does
+        it cover what lies behind it in part?"""
         key = (id(material), double, covers_in_part)
         if key not in self._worn:
-            one = material if material.double_sided == double else replace(material, double_sided=double)
+            one = (
+                material
+                if material.double_sided == double
+                else replace(material, double_sided=double)
+            )
             if covers_in_part and one.alpha_mode == "opaque":
                 one = replace(one, alpha_mode="blend")
             self._worn[key] = one
             self.transforms[id(one)] = dict(self.transforms.get(id(material), {}))
             if id(material) in self.tiles:
-                self.tiles[id(one)] = partial(self._tile_on_mesh, self.tiles[id(material)], double, covers_in_part)
+                self.tiles[id(one)] = partial(
+                    self._tile_on_mesh, self.tiles[id(material)], double, covers_in_part
+                )
         return self._worn[key]
 
     def _tile_on_mesh(
@@ -131,8 +146,8 @@ class MaterialReader:
         return self._on_mesh(read(tile), double, covers_in_part)
 
     def _bound_prim(self, prim: Any) -> Any:
-        """The material bound for the purpose "full", else for "preview", else for all. ``ComputeBoundMaterial`` goes on
-        from each purpose to bindings for all of them."""
+        """The material bound for the purpose "full", else for "preview", else for all.
+        ``ComputeBoundMaterial`` goes on from each purpose to bindings for all of them."""
         from pxr import UsdShade
 
         api = UsdShade.MaterialBindingAPI(prim)
@@ -147,7 +162,9 @@ class MaterialReader:
         from pxr import UsdShade
 
         api = UsdShade.MaterialBindingAPI(prim)
-        targets: list[Any] = next((t for p in _PURPOSES if (t := api.GetDirectBindingRel(p).GetTargets())), [])
+        targets: list[Any] = next(
+            (t for p in _PURPOSES if (t := api.GetDirectBindingRel(p).GetTargets())), []
+        )
         return targets[0].name if targets and not self.stage.GetPrimAtPath(targets[0]) else None
 
     def _bound(self, prim: Any) -> Material:
@@ -157,7 +174,9 @@ class MaterialReader:
         name = self._unresolved(prim)
         if name is not None:
             return self._read_once(name, partial(self._from_materialx, name))
-        return self._materials.setdefault("", Material(name="default", base_color=(1.0, 1.0, 1.0), roughness=0.5))
+        return self._materials.setdefault(
+            "", Material(name="default", base_color=(1.0, 1.0, 1.0), roughness=0.5)
+        )
 
     def _read_once(self, key: str, read: Callable[[], Material]) -> Material:
         if key not in self._materials:
@@ -183,10 +202,14 @@ class MaterialReader:
                     continue
                 where = str(Path(layer.realPath).resolve().parent / dependency)
                 instead = "default materials stand for its own"
-                file = self.companions.read(partial(self.companions.find, where, self.path), instead)
+                file = self.companions.read(
+                    partial(self.companions.find, where, self.path), instead
+                )
                 if file is None:
                     continue
-                surface = find_surface(file, name, self.companions, partial(self._read_beside, file), self._fitted)
+                surface = find_surface(
+                    file, name, self.companions, partial(self._read_beside, file), self._fitted
+                )
                 found = None if surface is None else read_surface(surface, name, self.note)
                 if found is not None:
                     self.note(f"material '{name}': read from {file.name}")
@@ -207,7 +230,11 @@ class MaterialReader:
         if not udim.is_tiled(text):
             return self.companions.read(lambda: read(text))
         self._in_tiles = True
-        return None if self._tile is None else udim.read_tile(text, self._tile, owner, self.companions, read)
+        return (
+            None
+            if self._tile is None
+            else udim.read_tile(text, self._tile, owner, self.companions, read)
+        )
 
     def _fitted(self, texture: Texture, text: str) -> Texture:
         if self._tile is None or not udim.is_tiled(text):
@@ -221,7 +248,11 @@ class MaterialReader:
             return self._preview(shader, name)
         for other in (shader, material.ComputeSurfaceSource("mtlx")[0]):
             node = UsdNode(other, self._read_input, self._fitted_input) if other else None
-            found = read_surface(node, name, self.note) if node is not None and node.category in SURFACES else None
+            found = (
+                read_surface(node, name, self.note)
+                if node is not None and node.category in SURFACES
+                else None
+            )
             if found is not None:
                 self._keep(*found)
                 return found[0]
@@ -238,7 +269,11 @@ class MaterialReader:
     def _preview(self, shader: Any, name: str) -> Material:
         of = partial(_input, shader)
         unlit = _reflects_nothing(shader)
-        color, color_map, _ = of("emissiveColor", (1.0, 1.0, 1.0)) if unlit else of("diffuseColor", (0.18, 0.18, 0.18))
+        color, color_map, _ = (
+            of("emissiveColor", (1.0, 1.0, 1.0))
+            if unlit
+            else of("diffuseColor", (0.18, 0.18, 0.18))
+        )
         roughness, rough_map, rough_channel = of("roughness", 0.5)
         metalness, metal_map, metal_channel = of("metallic", 0.0)
         _, normal_map, _ = of("normal", None)
@@ -247,7 +282,9 @@ class MaterialReader:
             roughness, rough_map, metalness, metal_map, normal_map = 1.0, None, 0.0, None, None
             glow, glow_map = (0.0, 0.0, 0.0), None
         base, base_factor = self._scaled(color_map, "srgb", "rgb", _rgb(color))
-        rough, rough_factor = self._scaled(rough_map, "linear", rough_channel, (float(roughness),) * 3)
+        rough, rough_factor = self._scaled(
+            rough_map, "linear", rough_channel, (float(roughness),) * 3
+        )
         if not unlit and int(of("useSpecularWorkflow", 0)[0]) == 1:
             tint, metal_map, _ = of("specularColor", (0.0, 0.0, 0.0))
             shine, shine_factor = self._scaled(metal_map, "srgb", "rgb", _rgb(tint))
@@ -256,9 +293,13 @@ class MaterialReader:
             base, base_factor, metal, metal_factor = _metallic(given)
             color_map = metal_map = color_map or metal_map  # both are made of both of its textures
         else:
-            metal, metal_factor = self._scaled(metal_map, "linear", metal_channel, (float(metalness),) * 3)
+            metal, metal_factor = self._scaled(
+                metal_map, "linear", metal_channel, (float(metalness),) * 3
+            )
         # without the texture that says where it glows, nothing does
-        emission, strength = self._scaled(glow_map, "srgb", "rgb", (0.0, 0.0, 0.0) if glow_map else _rgb(glow))
+        emission, strength = self._scaled(
+            glow_map, "srgb", "rgb", (0.0, 0.0, 0.0) if glow_map else _rgb(glow)
+        )
         normal, normal_scale = self._normals(normal_map)
         opacity, alpha, alpha_map, threshold = self._opacity(shader)
         if alpha is not None:
@@ -268,7 +309,9 @@ class MaterialReader:
                 )
             base, color_map = with_alpha(base, alpha), color_map if base is not None else alpha_map
         given = shader.GetInput("opacity")
-        veiled = bool(given) and given.HasConnectedSource() and alpha_map is None  # by a primvar of the mesh
+        veiled = (
+            bool(given) and given.HasConnectedSource() and alpha_map is None
+        )  # by a primvar of the mesh
         transparent = alpha is not None or opacity < 1 or veiled
         out = Material(
             name=name,
@@ -309,7 +352,8 @@ class MaterialReader:
         }
 
     def _opacity(self, shader: Any) -> tuple[float, Texture | None, Any, float]:
-        """(factor, texture of one channel or None, its node, threshold) of what a surface covers."""
+        """(factor, texture of one channel or None, its node, threshold) of what a surface
+        covers."""
         opacity, node, channel = _input(shader, "opacity", 1.0)
         threshold = float(_value(shader.GetInput("opacityThreshold")) or 0.0)
         texture, factor = self._scaled(node, "linear", channel, (float(opacity),) * 3)
@@ -322,8 +366,8 @@ class MaterialReader:
     def _scaled(
         self, node: Any, space: str, channel: str, constant: tuple[float, float, float]
     ) -> tuple[Texture | None, tuple[float, float, float]]:
-        """(texture or None, its factor) of an input: ``constant`` without a texture. A bias cannot be a factor, and
-        becomes part of the texture."""
+        """(texture or None, its factor) of an input: ``constant`` without a texture. A bias cannot
+        be a factor, and becomes part of the texture."""
         texture = self._texture(node, space, channel) if node else None
         if texture is None:
             return None, constant
@@ -337,8 +381,8 @@ class MaterialReader:
         return Texture(values, "linear", texture.wrap), (1.0, 1.0, 1.0)
 
     def _normals(self, node: Any) -> tuple[Texture | None, float]:
-        """(normal map stored as (n + 1) / 2, strength). Normals are texels times the sampler's scale plus its bias,
-        usually 2 and -1; files that leave both out mean these."""
+        """(normal map stored as (n + 1) / 2, strength). Normals are texels times the sampler's
+        scale plus its bias, usually 2 and -1; files that leave both out mean these."""
         texture = self._texture(node, "linear") if node else None
         if texture is None:
             return None, 1.0
@@ -346,7 +390,9 @@ class MaterialReader:
         scale = _vector(node, "scale", 1.0 if given else 2.0)[:3]
         bias = _vector(node, "bias", 0.0 if given else -1.0)[:3]
         strength = scale[0] / 2
-        if strength > 0 and np.allclose((scale, bias), ((2 * strength, 2 * strength, 2), (-strength, -strength, -1))):
+        if strength > 0 and np.allclose(
+            (scale, bias), ((2 * strength, 2 * strength, 2), (-strength, -strength, -1))
+        ):
             return texture, strength
         normals = texture.linear()[..., :3] * np.float32(scale) + np.float32(bias)
         return Texture(normals * np.float32(0.5) + np.float32(0.5), "linear", texture.wrap), 1.0
@@ -371,13 +417,15 @@ class MaterialReader:
                 space = "linear"
                 pixels = pixels if pixels.shape[2] == 4 else _opaque(pixels)
             pixels = pixels[..., _CHANNEL[channel]][..., None]
-        wraps = tuple(_WRAPS.get(str(_value(node.GetInput(k))), "repeat") for k in ("wrapS", "wrapT"))
+        wraps = tuple(
+            _WRAPS.get(str(_value(node.GetInput(k))), "repeat") for k in ("wrapS", "wrapT")
+        )
         texture = Texture(np.ascontiguousarray(pixels), space, wraps)  # type: ignore[arg-type]
         return self._fitted(texture, text)
 
     def _read_image(self, text: str, there: bool) -> NDArray | None:
-        """Pixels of a file. None if it is missing and that is to be ignored, or if it is one in tiles and none is
-        asked for. ``there``: is it known that some of its tiles exist?"""
+        """Pixels of a file. None if it is missing and that is to be ignored, or if it is one in
+        tiles and none is asked for. ``there``: is it known that some of its tiles exist?"""
         if not udim.is_tiled(text):
             return self.companions.read(lambda: self._image(text))
         self._in_tiles = True
@@ -403,16 +451,26 @@ def _what_it_has(material: Any) -> str:
     for output in material.GetSurfaceOutputs():
         for attribute in UsdShade.Utils.GetValueProducingAttributes(output):
             shader = UsdShade.Shader(attribute.GetPrim())
-            inside = (shader.GetPrim().GetAttribute(f"info:{k}:sourceAsset:subIdentifier") for k in ("mdl", "osl"))
+            inside = (
+                shader.GetPrim().GetAttribute(f"info:{k}:sourceAsset:subIdentifier")
+                for k in ("mdl", "osl")
+            )
             named = (a.Get() for a in inside if a)
-            kinds.append(str(shader.GetIdAttr().Get() or next(named, None) or attribute.GetPrim().GetTypeName()))
+            kinds.append(
+                str(
+                    shader.GetIdAttr().Get()
+                    or next(named, None)
+                    or attribute.GetPrim().GetTypeName()
+                )
+            )
     if not kinds:
         return "it has no surface shader"
     return f"its surface {', '.join(repr(k) for k in dict.fromkeys(kinds))} is not understood"
 
 
 def _file(source: Any) -> tuple[str, bool]:
-    """(name of the file that an input holds, as USD resolves it, or empty; does it stand for tiles that exist?)"""
+    """(name of the file that an input holds, as USD resolves it, or empty; does it stand for tiles
+    that exist?)"""
     from pxr import UsdShade
 
     asset = _value(source)
@@ -426,8 +484,8 @@ def _file(source: Any) -> tuple[str, bool]:
 
 
 def _purpose(binding: Any) -> str:
-    """The purpose for which a relationship binds a material: "material:binding[:PURPOSE]", or, for a collection,
-    "material:binding:collection[:PURPOSE]:NAME" (UsdShadeMaterialBindingAPI)."""
+    """The purpose for which a relationship binds a material: "material:binding[:PURPOSE]", or, for
+    a collection, "material:binding:collection[:PURPOSE]:NAME" (UsdShadeMaterialBindingAPI)."""
     words = binding.GetName().split(":")[2:]
     if words[:1] == ["collection"]:
         words = words[1:-1]
@@ -447,9 +505,12 @@ def _key(material: Any) -> str:
 
 
 def _reflects_nothing(shader: Any) -> bool:
-    """Does a UsdPreviewSurface emit light and reflect none? That is how one is shown in its colour whatever the light,
-    for which USD has no other word."""
-    values = [_input(shader, key, (0.18,) * 3 if key == "diffuseColor" else (0.0,) * 3) for key in _REFLECTANCES]
+    """Does a UsdPreviewSurface emit light and reflect none? That is how one is shown in its colour
+    whatever the light, for which USD has no other word."""
+    values = [
+        _input(shader, key, (0.18,) * 3 if key == "diffuseColor" else (0.0,) * 3)
+        for key in _REFLECTANCES
+    ]
     dark = all(node is None and not any(color) for color, node, _ in values)
     glow = shader.GetInput("emissiveColor")
     shown = bool(glow) and (glow.HasConnectedSource() or any(_value(glow) or ()))
@@ -463,7 +524,10 @@ def _input(shader: Any, key: str, default: Any) -> tuple[Any, Any, str]:
     source = shader.GetInput(key)
     if source and source.HasConnectedSource():
         attributes = UsdShade.Utils.GetValueProducingAttributes(source)
-        if attributes and UsdShade.Utils.GetType(attributes[0].GetName()) == UsdShade.AttributeType.Output:
+        if (
+            attributes
+            and UsdShade.Utils.GetType(attributes[0].GetName()) == UsdShade.AttributeType.Output
+        ):
             node = UsdShade.Shader(attributes[0].GetPrim())
             output = UsdShade.Output(attributes[0]).GetBaseName()
             if str(node.GetIdAttr().Get()) == "UsdUVTexture":
@@ -477,8 +541,8 @@ def _input(shader: Any, key: str, default: Any) -> tuple[Any, Any, str]:
 def _metallic(
     given: Specular,
 ) -> tuple[Texture | None, tuple[float, float, float], Texture | None, tuple[float, float, float]]:
-    """(base colour, its factor, metalness, its factor) of the specular workflow, whose two colours mean what those of
-    glTF's specular-glossiness materials do."""
+    """(base colour, its factor, metalness, its factor) of the specular workflow, whose two colours
+    mean what those of glTF's specular-glossiness materials do."""
     if given.diffuse_texture is None and given.specular_texture is None:
         color, _, metalness = specular_glossiness.constants(given)
         return None, color, None, (metalness,) * 3
@@ -488,7 +552,8 @@ def _metallic(
 
 
 def _vector(node: Any, key: str, default: float) -> Any:
-    """Four numbers of an input of a sampler: what a texture's values are multiplied by, or what is added."""
+    """Four numbers of an input of a sampler: what a texture's values are multiplied by, or what is
+    added."""
     value = _value(node.GetInput(key))
     return (default,) * 4 if value is None else tuple(float(x) for x in value)
 
@@ -511,7 +576,9 @@ def _place(node: Any) -> Place:
             return Place(str(_value(before.GetInput("varname")) or "st"), matrix)
         if kind != "UsdTransform2d":
             break
-        scale, rotation, move = (_value(before.GetInput(k)) for k in ("scale", "rotation", "translation"))
+        scale, rotation, move = (
+            _value(before.GetInput(k)) for k in ("scale", "rotation", "translation")
+        )
         first = uv_transforms.usd_affine(
             (1.0, 1.0) if scale is None else tuple(scale),
             0.0 if rotation is None else float(rotation),
@@ -540,7 +607,9 @@ def _constant(source: Any, node: Any, output: str, default: Any) -> Any:
 
 def _reads_primvar(shader: Any, name: str) -> bool:
     names = (str(_value(shader.GetInput(n))) for n in ("varname", "geomprop"))
-    is_color = name == "displayColor" and str(shader.GetIdAttr().Get() or "").startswith("ND_geomcolor")
+    is_color = name == "displayColor" and str(shader.GetIdAttr().Get() or "").startswith(
+        "ND_geomcolor"
+    )
     return is_color or name in names
 
 

@@ -1,4 +1,5 @@
-"""MaterialX networks that USD composes: UsdShade prims whose identifiers are names of MaterialX node definitions."""
+"""MaterialX networks that USD composes: UsdShade prims whose identifiers are names of MaterialX
+node definitions."""
 
 from __future__ import annotations
 
@@ -17,7 +18,9 @@ if TYPE_CHECKING:
 
     from appearance_opt.asset.types import ColorSpace, Texture
 
-_TYPE = re.compile(r"(float[234]?|integer|boolean|color[34]|vector[234]|string|surfaceshader|material)(FA|B|I)?")
+_TYPE = re.compile(
+    r"(float[234]?|integer|boolean|color[34]|vector[234]|string|surfaceshader|material)(FA|B|I)?"
+)
 _WIDTHS = {
     "float2": 2,
     "float3": 3,
@@ -47,15 +50,21 @@ def category(identifier: str) -> tuple[str, int, bool]:
     width = {"extract": 1, "gltf_colorimage": 3, "normalmap": 3}.get(name)
     if name in ("convert", "swizzle"):
         types = types[1:] or types
-    colors = name in ("gltf_colorimage", "UsdUVTexture") or bool(types and types[0].startswith("color"))
+    colors = name in ("gltf_colorimage", "UsdUVTexture") or bool(
+        types and types[0].startswith("color")
+    )
     return name, width if width is not None else _WIDTHS.get(types[0], 0) if types else 0, colors
 
 
 class UsdNode:
-    """A shader prim, see ``materialx_nodes.Node``. ``read``: pixels of the file of an input; ``fitted``: see there."""
+    """A shader prim, see ``materialx_nodes.Node``. ``read``: pixels of the file of an input;
+    ``fitted``: see there."""
 
     def __init__(
-        self, shader: Any, read: Callable[[Any], NDArray | None], fitted: Callable[[Texture, Any], Texture]
+        self,
+        shader: Any,
+        read: Callable[[Any], NDArray | None],
+        fitted: Callable[[Texture, Any], Texture],
     ) -> None:
         self._shader, self._read, self._fitted = shader, read, fitted
         self.name = str(shader.GetPrim().GetName())
@@ -75,7 +84,10 @@ class UsdNode:
             node = UsdShade.Shader(source.GetPrim())
             if not node or not node.GetIdAttr().Get():
                 return None
-            return Input(node=UsdNode(node, self._read, self._fitted), output=UsdShade.Output(source).GetBaseName())
+            return Input(
+                node=UsdNode(node, self._read, self._fitted),
+                output=UsdShade.Output(source).GetBaseName(),
+            )
         return _constant(source, self.category)
 
     def picture(self) -> NDArray | None:
@@ -110,7 +122,9 @@ def _space(attribute: Any, owner: str) -> ColorSpace | None:
     named = str(attribute.GetColorSpace() or "")
     if attribute.GetTypeName() == "asset" and owner == "UsdUVTexture":
         source = attribute.GetPrim().GetAttribute("inputs:sourceColorSpace")
-        named = named or {"sRGB": "srgb_texture", "raw": "raw"}.get(str(source.Get() if source else ""), "")
+        named = named or {"sRGB": "srgb_texture", "raw": "raw"}.get(
+            str(source.Get() if source else ""), ""
+        )
     if not named:
         return None
     return "srgb" if named.lower().startswith(("srgb", "g22", "gamma22")) else "linear"

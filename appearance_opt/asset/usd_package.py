@@ -13,10 +13,11 @@ if TYPE_CHECKING:
 
 
 def read_packaged(name: str, owner: Path) -> bytes:
-    """Bytes of the file of that name, which ``owner`` refers to. Raises InputError, MissingFileError if there is none.
+    """Bytes of the file of that name, which ``owner`` refers to. Raises InputError,
+    MissingFileError if there is none.
 
-    Older versions of usd-core cannot read it from Python. Entries are stored plain (USDZ specification, "Zip
-    constraints"): none is longer than its package.
+    Older versions of usd-core cannot read it from Python. Entries are stored plain (USDZ
+    specification, "Zip constraints"): none is longer than its package.
     """
     package, *inside = name.replace("]", "").split("[")
     source: str | io.BytesIO = package
@@ -24,7 +25,9 @@ def read_packaged(name: str, owner: Path) -> bytes:
         for entry in inside:
             with zipfile.ZipFile(source) as opened:
                 if opened.getinfo(entry).compress_type != zipfile.ZIP_STORED:
-                    raise InputError(f"{name}: is compressed; store it in its package without compression")
+                    raise InputError(
+                        f"{name}: is compressed; store it in its package without compression"
+                    )
                 source = io.BytesIO(opened.read(entry))
     except (KeyError, FileNotFoundError):
         raise MissingFileError(f"{owner}: refers to '{name}', which does not exist") from None

@@ -57,9 +57,9 @@ def load_usd(
     companions: Companions | None = None,
     keep_layout: bool = False,
 ) -> Asset:
-    """Read a stage at its earliest time, variants at their selection (or as ``variants`` says: set name ->
-    variant, on the default prim). Catmull-Clark and Loop meshes are refined ``refine`` times.
-    ``keep_layout``: see ``asset.load``. Raises InputError."""
+    """Read a stage at its earliest time, variants at their selection (or as ``variants`` says: set
+    name -> variant, on the default prim). Catmull-Clark and Loop meshes are refined ``refine``
+    times. ``keep_layout``: see ``asset.load``. Raises InputError."""
     from pxr import Tf, UsdUtils
 
     path = Path(path)
@@ -71,10 +71,19 @@ def load_usd(
         asset = _read_stage(path, refine, variants or {}, companions, keep_layout)
     except Tf.ErrorException as error:
         # the first of what went wrong: the place in the file, if it is text
-        said = [_text(partial(getattr, one, "commentary")) for one in error.args if hasattr(one, "commentary")]
-        raise InputError(f"{path}: not a readable USD file ({(said or [_text(error.__str__)])[0]})") from None
+        said = [
+            _text(partial(getattr, one, "commentary"))
+            for one in error.args
+            if hasattr(one, "commentary")
+        ]
+        raise InputError(
+            f"{path}: not a readable USD file ({(said or [_text(error.__str__)])[0]})"
+        ) from None
     finally:
-        warned = [_text(partial(getattr, w, "commentary")) for w in diagnostics.TakeUncoalescedDiagnostics()]
+        warned = [
+            _text(partial(getattr, w, "commentary"))
+            for w in diagnostics.TakeUncoalescedDiagnostics()
+        ]
     told = Notes()
     for warning in warned:
         text = _ADDRESS.sub("", warning)
@@ -85,7 +94,9 @@ def load_usd(
     return replace(asset, notes=asset.notes + told.lines())
 
 
-def _read_stage(path: Path, refine: int, variants: dict[str, str], companions: Companions, keep_layout: bool) -> Asset:
+def _read_stage(
+    path: Path, refine: int, variants: dict[str, str], companions: Companions, keep_layout: bool
+) -> Asset:
     from pxr import Usd
 
     stage = Usd.Stage.Open(str(path))
@@ -104,15 +115,24 @@ def _select(stage: Any, variants: dict[str, str], path: Path) -> None:
         if not name:
             raise InputError(f"{path}: --variant {choice}: write it as set=name")
         sets = prim.GetVariantSets() if prim else None
-        if sets is None or not sets.HasVariantSet(name) or choice not in sets.GetVariantSet(name).GetVariantNames():
-            have = {n: sets.GetVariantSet(n).GetVariantNames() for n in sets.GetNames()} if sets else {}
+        if (
+            sets is None
+            or not sets.HasVariantSet(name)
+            or choice not in sets.GetVariantSet(name).GetVariantNames()
+        ):
+            have = (
+                {n: sets.GetVariantSet(n).GetVariantNames() for n in sets.GetNames()}
+                if sets
+                else {}
+            )
             raise InputError(f"{path}: has no variant {name}={choice}; there are {have or 'none'}")
         sets.GetVariantSet(name).SetVariantSelection(choice)
 
 
 def _refuse_escapes(stage: Any, path: Path, companions: Companions) -> None:
-    """Layers outside the folder of the root layer, or the one that is allowed, are not read on behalf of it. Raises
-    InputError, which names the folder to allow for all that the asset refers to."""
+    """Layers outside the folder of the root layer, or the one that is allowed, are not read on
+    behalf of it. Raises InputError, which names the folder to allow for all that the asset refers
+    to."""
     for layer in stage.GetUsedLayers():
         if layer.anonymous or not layer.realPath:
             continue
@@ -132,7 +152,11 @@ def _folder_of_all(stage: Any, path: Path, root: Path | None) -> Path:
     from pxr import UsdUtils
 
     layers, files, _ = UsdUtils.ComputeAllDependencies(stage.GetRootLayer().identifier)
-    names = [*(layer.realPath for layer in layers), *files, *(layer.realPath for layer in stage.GetUsedLayers())]
+    names = [
+        *(layer.realPath for layer in layers),
+        *files,
+        *(layer.realPath for layer in stage.GetUsedLayers()),
+    ]
     folders = {Path(name.split("[")[0]).resolve().parent for name in names if name}
     own = path.resolve().parent
     outside = [folder for folder in folders if not folder.is_relative_to(own)]
@@ -140,8 +164,8 @@ def _folder_of_all(stage: Any, path: Path, root: Path | None) -> Path:
 
 
 def _mention_all(stage: Any, path: Path, companions: Companions) -> None:
-    """Layers and packages, and whatever they refer to: layers of variants that are not chosen, pictures that no
-    material shows."""
+    """Layers and packages, and whatever they refer to: layers of variants that are not chosen,
+    pictures that no material shows."""
     from pxr import UsdUtils
 
     for layer in stage.GetUsedLayers():
@@ -163,8 +187,8 @@ def _metres_per_unit(stage: Any) -> float:
 
 
 def _count_prims(stage: Any) -> int:
-    """Prims of a stage, those of instances counted as often as they are instanced: a walk through instances of
-    instances may be far longer than the file."""
+    """Prims of a stage, those of instances counted as often as they are instanced: a walk through
+    instances of instances may be far longer than the file."""
     from pxr import Usd
 
     below: dict[str, int] = {}
@@ -183,9 +207,9 @@ def _count_prims(stage: Any) -> int:
 
 @dataclass(frozen=True)
 class _Geometry:
-    """A mesh in its own coordinates. ``values``: positions ("points") and other attributes by name, each with
-    faces of its own; ``face_ids``: the file's face of each face; ``flipped``: do faces turn clockwise? ``holes``:
-    faces of the file that are not drawn."""
+    """A mesh in its own coordinates. ``values``: positions ("points") and other attributes by name,
+    each with faces of its own; ``face_ids``: the file's face of each face; ``flipped``: do faces
+    turn clockwise? ``holes``: faces of the file that are not drawn."""
 
     values: dict[str, tuple[NDArray, Polygons]]
     face_ids: NDArray[np.int64]
@@ -194,7 +218,9 @@ class _Geometry:
 
 
 class _Reader:
-    def __init__(self, stage: Any, path: Path, refine: int, companions: Companions, keep_layout: bool) -> None:
+    def __init__(
+        self, stage: Any, path: Path, refine: int, companions: Companions, keep_layout: bool
+    ) -> None:
         from pxr import Usd, UsdGeom
 
         self.stage, self.path, self.refine, self.keep_layout = stage, path, refine, keep_layout
@@ -225,13 +251,18 @@ class _Reader:
         return Asset(tuple(meshes), self.path.stem, notes, origin=origin, contents=self._contents())
 
     def _contents(self) -> Contents:
-        """Skeletons, animations of theirs or the frames of the stage, and the variants of the default prim."""
+        """Skeletons, animations of theirs or the frames of the stage, and the variants of the
+        default prim."""
         found: dict[str, list[str]] = {"Skeleton": [], "SkelAnimation": []}
         for prim in self.stage.Traverse():
             if prim.GetTypeName() in found:
                 found[prim.GetTypeName()].append(str(prim.GetName()))
         clips, stage = found["SkelAnimation"], self.stage
-        if not clips and stage.HasAuthoredTimeCodeRange() and stage.GetEndTimeCode() > stage.GetStartTimeCode():
+        if (
+            not clips
+            and stage.HasAuthoredTimeCodeRange()
+            and stage.GetEndTimeCode() > stage.GetStartTimeCode()
+        ):
             clips = [f"frames {stage.GetStartTimeCode():g} to {stage.GetEndTimeCode():g}"]
         top = stage.GetDefaultPrim()
         sets = [top.GetVariantSet(name) for name in top.GetVariantSets().GetNames()] if top else []
@@ -292,7 +323,9 @@ class _Reader:
             back = self.cache.GetLocalToWorldTransform(root).GetInverse()
             for part in Usd.PrimRange(root, Usd.TraverseInstanceProxies()):
                 if part.IsA(UsdGeom.PointInstancer):
-                    self.note(f"'{part.GetPath()}': ignored, it is a prototype of another PointInstancer")
+                    self.note(
+                        f"'{part.GetPath()}': ignored, it is a prototype of another PointInstancer"
+                    )
                 if not part.IsA(UsdGeom.Gprim) or not self._shown(part):
                     continue
                 local = np.array(self._to_world(part) * back)
@@ -307,14 +340,15 @@ class _Reader:
         return place_copies(mesh, place, mesh.name)
 
     def _place(self, to_world: Any) -> Instances:
-        """Where the copies of a mesh are, in metres, Y up; ``to_world``: (P, 4, 4) for rows, as USD has them."""
+        """Where the copies of a mesh are, in metres, Y up; ``to_world``: (P, 4, 4) for rows, as USD
+        has them."""
         metres = np.eye(4)
         metres[:3, :3] = self.to_metres
         return Instances(metres @ np.asarray(to_world).transpose(0, 2, 1))
 
     def _parts(self, prim: Any) -> list[Mesh]:
-        """The triangles of a mesh or a shape in its own coordinates, in double precision, one mesh for
-        each material. What instances share is read once."""
+        """The triangles of a mesh or a shape in its own coordinates, in double precision, one mesh
+        for each material. What instances share is read once."""
         key = self._shared(prim)
         if key is None:
             return self._split(prim)
@@ -323,8 +357,8 @@ class _Reader:
         return self._read[key]
 
     def _shared(self, prim: Any) -> tuple[str, ...] | None:
-        """What instances have in common that look alike: their prim in the prototype, and what is bound to them. None
-        for what is no instance."""
+        """What instances have in common that look alike: their prim in the prototype, and what is
+        bound to them. None for what is no instance."""
         if not prim.IsInstanceProxy():
             return None
         return str(prim.GetPrimInPrototype().GetPath()), *self.materials.bound_keys(prim)
@@ -339,18 +373,28 @@ class _Reader:
             return _Geometry(*self._mesh(prim, flipped), flipped, np.array(holes or [], np.int64))
         found = usd_shapes.triangles(prim, self.time)
         if found is None:
-            self.note(f"{prim.GetTypeName()} '{prim.GetPath()}': ignored, only meshes and plain shapes are read")
+            self.note(
+                f"{prim.GetTypeName()} '{prim.GetPath()}': ignored, only meshes and plain shapes are read"
+            )
             return None
         positions, normals, faces = found
         polygons = Polygons(np.full(len(faces), 3), faces.ravel())
-        values = {"points": (positions, polygons), "normals": (normals, polygons), **self._colors(prim, polygons)}
+        values = {
+            "points": (positions, polygons),
+            "normals": (normals, polygons),
+            **self._colors(prim, polygons),
+        }
         return _Geometry(values, np.arange(len(faces)), flipped, np.empty(0, np.int64))
 
-    def _mesh(self, prim: Any, flipped: bool) -> tuple[dict[str, tuple[NDArray, Polygons]], NDArray[np.int64]]:
-        """Attributes and the file's faces of a mesh, refined if it is a subdivision surface (see ``_Geometry``).
+    def _mesh(
+        self, prim: Any, flipped: bool
+    ) -> tuple[dict[str, tuple[NDArray, Polygons]], NDArray[np.int64]]:
+        """Attributes and the file's faces of a mesh, refined if it is a subdivision surface (see
+        ``_Geometry``).
 
-        A polygonal mesh without normals "should be treated and rendered as faceted, with no attempt to
-        compute smooth normals" (UsdGeomMesh, "A Note About Normals"), and so are bilinear ones."""
+        A polygonal mesh without normals "should be treated and rendered as faceted, with no attempt
+        to compute smooth normals" (UsdGeomMesh, "A Note About Normals"), and so are bilinear
+        ones."""
         from pxr import UsdGeom
 
         mesh = UsdGeom.Mesh(prim)
@@ -358,9 +402,13 @@ class _Reader:
         counts = np.array(mesh.GetFaceVertexCountsAttr().Get(self.time) or [], np.int64)
         indices = np.array(mesh.GetFaceVertexIndicesAttr().Get(self.time) or [], np.int64)
         if counts.sum() != len(indices) or (counts < 0).any():
-            raise InputError(f"{self.path}, mesh '{prim.GetPath()}': its face counts do not match its indices")
+            raise InputError(
+                f"{self.path}, mesh '{prim.GetPath()}': its face counts do not match its indices"
+            )
         if len(indices) and (indices.min() < 0 or indices.max() >= len(points)):
-            raise InputError(f"{self.path}, mesh '{prim.GetPath()}': faces refer to points that do not exist")
+            raise InputError(
+                f"{self.path}, mesh '{prim.GetPath()}': faces refer to points that do not exist"
+            )
         refined = 4**self.refine if str(mesh.GetSubdivisionSchemeAttr().Get()) in _REFINED else 1
         self.companions.budget.take(len(points) * refined, "vertices", self.path)
         self.companions.budget.take(len(indices) * refined, "faces", self.path)
@@ -393,27 +441,41 @@ class _Reader:
             for _ in range(self.refine):
                 face_ids = np.repeat(face_ids, values["points"][1].counts)
                 for name, (value, where) in values.items():
-                    value, where, left = catmull_clark(value, where, name.startswith(_UVS), sharpness.get(name))
+                    value, where, left = catmull_clark(
+                        value, where, name.startswith(_UVS), sharpness.get(name)
+                    )
                     values[name] = value, where
                     if name in sharpness:
                         sharpness[name] = left
         return values, face_ids
 
     def _sharpness(self, mesh: Any, vertices: int) -> Sharpness:
-        """Creases and corners of a subdivision surface. Raises InputError if their numbers do not fit together."""
+        """Creases and corners of a subdivision surface. Raises InputError if their numbers do not
+        fit together."""
 
         def numbers(attribute: Any, kind: type) -> NDArray:
             return np.array(attribute.Get(self.time) or [], kind)
 
-        indices, lengths = (numbers(a, np.int64) for a in (mesh.GetCreaseIndicesAttr(), mesh.GetCreaseLengthsAttr()))
+        indices, lengths = (
+            numbers(a, np.int64) for a in (mesh.GetCreaseIndicesAttr(), mesh.GetCreaseLengthsAttr())
+        )
         given = numbers(mesh.GetCreaseSharpnessesAttr(), np.float64)
         corners, corner = numbers(mesh.GetCornerIndicesAttr(), np.int64), np.zeros(vertices)
         at_corners = numbers(mesh.GetCornerSharpnessesAttr(), np.float64)
         every = np.concatenate([indices, corners])
-        fits = lengths.sum() == len(indices) and (lengths > 1).all() and len(corners) == len(at_corners)
-        fits &= len(given) in (len(lengths), (lengths - 1).sum()) and not ((every < 0) | (every >= vertices)).any()
+        fits = (
+            lengths.sum() == len(indices)
+            and (lengths > 1).all()
+            and len(corners) == len(at_corners)
+        )
+        fits &= (
+            len(given) in (len(lengths), (lengths - 1).sum())
+            and not ((every < 0) | (every >= vertices)).any()
+        )
         if not fits:
-            raise InputError(f"{self.path}, mesh '{mesh.GetPath()}': its creases or corners do not fit the mesh")
+            raise InputError(
+                f"{self.path}, mesh '{mesh.GetPath()}': its creases or corners do not fit the mesh"
+            )
         corner[corners] = at_corners
         if not len(lengths):
             return Sharpness(np.empty((0, 2), np.int64), np.empty(0), corner)
@@ -423,7 +485,9 @@ class _Reader:
         each = given if len(given) == len(at) else np.repeat(given, lengths - 1)
         return Sharpness(np.stack([indices[at], indices[at + 1]], axis=1), each, corner)
 
-    def _primvars(self, prim: Any, mesh: Any, polygons: Polygons) -> dict[str, tuple[NDArray, Polygons]]:
+    def _primvars(
+        self, prim: Any, mesh: Any, polygons: Polygons
+    ) -> dict[str, tuple[NDArray, Polygons]]:
         """Normals, texture coordinates and colours, each as values and faces of its own."""
         from pxr import UsdGeom
 
@@ -434,7 +498,10 @@ class _Reader:
             if uv and uv.HasValue():
                 found = _expand(uv.ComputeFlattened(self.time), uv.GetInterpolation(), polygons, 2)
                 if found is not None:
-                    out[_UVS + name] = (np.stack([found[0][:, 0], 1 - found[0][:, 1]], axis=1), found[1])
+                    out[_UVS + name] = (
+                        np.stack([found[0][:, 0], 1 - found[0][:, 1]], axis=1),
+                        found[1],
+                    )
         out |= self._colors(prim, polygons)
         normals = api.GetPrimvar("normals")
         value, how = None, ""
@@ -452,10 +519,15 @@ class _Reader:
 
         api = UsdGeom.PrimvarsAPI(prim)
         out = {}
-        for name, primvar, width in (("colors", "displayColor", 3), ("opacity", "displayOpacity", 1)):
+        for name, primvar, width in (
+            ("colors", "displayColor", 3),
+            ("opacity", "displayOpacity", 1),
+        ):
             given = api.GetPrimvar(primvar)
             if given and given.HasValue() and self.materials.reads_primvar(prim, primvar):
-                found = _expand(given.ComputeFlattened(self.time), given.GetInterpolation(), polygons, width)
+                found = _expand(
+                    given.ComputeFlattened(self.time), given.GetInterpolation(), polygons, width
+                )
                 if found is not None:
                     out[name] = found
         if "opacity" in out and (out["opacity"][0] >= OPAQUE).all():
@@ -477,7 +549,9 @@ class _Reader:
         if len(geometry.holes):
             drawn = ~np.isin(face_ids[face], geometry.holes)
             corners, face = corners[drawn], face[drawn]
-        for material, uv_names, chosen in self.materials.bindings(prim, face_ids[face], "opacity" in values):
+        for material, uv_names, chosen in self.materials.bindings(
+            prim, face_ids[face], "opacity" in values
+        ):
             names = [n for n in values if not n.startswith(_UVS) or n[len(_UVS) :] in uv_names]
             rows = np.stack([values[n][1].indices[corners[chosen]].ravel() for n in names], axis=1)
             if not len(rows):
@@ -516,7 +590,9 @@ def _facets(points: NDArray, polygons: Polygons, flipped: bool) -> tuple[NDArray
     return normals[of_kind].astype(np.float64), Polygons(polygons.counts, index[face])
 
 
-def _expand(value: Any, how: str, polygons: Polygons, width: int) -> tuple[NDArray, Polygons] | None:
+def _expand(
+    value: Any, how: str, polygons: Polygons, width: int
+) -> tuple[NDArray, Polygons] | None:
     """A primvar as (values (N, width), faces into them); None when its size does not fit its
     interpolation."""
     v = np.array(value, np.float64)
@@ -538,7 +614,8 @@ def _expand(value: Any, how: str, polygons: Polygons, width: int) -> tuple[NDArr
 
 
 def _text(get: Callable[[], str]) -> str:
-    """What USD says, in one line, without the names of its own functions. It may quote bytes that are no text."""
+    """What USD says, in one line, without the names of its own functions. It may quote bytes that
+    are no text."""
     try:
         return re.sub(r"pxrInternal\w*::(?:\w+::)*", "", " ".join(get().split()))[:200]
     except UnicodeDecodeError:

@@ -32,10 +32,10 @@ SIBLINGS = 500
 
 
 def save_usd(asset: Asset, path: Path) -> None:
-    """Write .usd, .usda or .usdc with PNG files in ``<stem>_textures/``, or one .usdz package. Y up,
-    metres. Vertex colours, times the base colour, are read by the surface where it has no texture of that; a
-    UsdPreviewSurface cannot multiply the two. What light passes through becomes opacity: of ``alpha.coverage``.
-    Raises OSError when the disk refuses."""
+    """Write .usd, .usda or .usdc with PNG files in ``<stem>_textures/``, or one .usdz package. Y
+    up, metres. Vertex colours, times the base colour, are read by the surface where it has no
+    texture of that; a UsdPreviewSurface cannot multiply the two. What light passes through becomes
+    opacity: of ``alpha.coverage``. Raises OSError when the disk refuses."""
     from pxr import Sdf, Tf, UsdUtils
 
     path = Path(path)
@@ -73,14 +73,17 @@ def _write_stage(asset: Asset, root: Path, textures: str) -> None:
         if key not in materials:
             word = Tf.MakeValidIdentifier(mesh.material.name)[:MAX_NAME]
             target = f"/{name}/Materials/M{len(materials)}_{word}"
-            materials[key] = _material(stage, target, mesh.material, root.parent / textures, key[1], key[2])
+            materials[key] = _material(
+                stage, target, mesh.material, root.parent / textures, key[1], key[2]
+            )
         parent = _parent(stage, name, k, len(asset.meshes))
         _mesh(stage, f"{parent}/G{k}_{Tf.MakeValidIdentifier(mesh.name)}", mesh, materials[key])
     stage.GetRootLayer().Save()
 
 
 def _parent(stage: Any, name: str, number: int, count: int) -> str:
-    """The prim below which a mesh goes: the top, or a group, for what has many siblings takes long to add."""
+    """The prim below which a mesh goes: the top, or a group, for what has many siblings takes long
+    to add."""
     from pxr import UsdGeom
 
     if count <= SIBLINGS:
@@ -109,13 +112,16 @@ def _mesh(stage: Any, target: str, mesh: Mesh, material: Any) -> None:
     out = UsdGeom.Mesh.Define(stage, target)
     out.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
     positions = np.ascontiguousarray(mesh.positions, np.float32)
-    # vertices in one place are one point: editors take edges between points that are apart for a rim
+    # vertices in one place are one point: editors take edges between points that are apart for a
+    # rim
     first, place = _distinct(positions)
     points, corners = positions[first], place[mesh.faces.ravel()].astype(np.int32)
     out.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(points))
     out.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(mesh.faces), 3, np.int32)))
     out.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(corners))
-    out.CreateExtentAttr(Vt.Vec3fArray.FromNumpy(np.stack([points.min(axis=0), points.max(axis=0)])))
+    out.CreateExtentAttr(
+        Vt.Vec3fArray.FromNumpy(np.stack([points.min(axis=0), points.max(axis=0)]))
+    )
     out.CreateDoubleSidedAttr(mesh.material.double_sided)
     kinds = Sdf.ValueTypeNames
     if mesh.normals is not None:
@@ -135,7 +141,8 @@ def _mesh(stage: Any, target: str, mesh: Mesh, material: Any) -> None:
 
 
 def _add_primvar(out: Any, name: str, kind: Any, values: NDArray, faces: NDArray) -> None:
-    """Add a face-varying primvar to a mesh, with indices where that is smaller. ``values`` (V, K) of the vertices."""
+    """Add a face-varying primvar to a mesh, with indices where that is smaller. ``values`` (V, K)
+    of the vertices."""
     from pxr import UsdGeom, Vt
 
     values = np.ascontiguousarray(values, np.float32)
@@ -152,7 +159,8 @@ def _add_primvar(out: Any, name: str, kind: Any, values: NDArray, faces: NDArray
 
 
 def _distinct(values: NDArray[np.float32]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """(first row of each kind, in the order of the rows; kind of each row) of (N, K) numbers; both zeros are one."""
+    """(first row of each kind, in the order of the rows; kind of each row) of (N, K) numbers; both
+    zeros are one."""
     _, kind = unique_rows((values + np.float32(0)).view(np.uint32).astype(np.int64))
     first = np.full(kind.max(initial=-1) + 1, len(kind))
     np.minimum.at(first, kind, np.arange(len(kind)))
@@ -162,7 +170,9 @@ def _distinct(values: NDArray[np.float32]) -> tuple[NDArray[np.intp], NDArray[np
     return first[order], rank[kind]
 
 
-def _material(stage: Any, target: str, m: Material, folder: Path, colored: bool, veiled: bool) -> Any:
+def _material(
+    stage: Any, target: str, m: Material, folder: Path, colored: bool, veiled: bool
+) -> Any:
     from pxr import UsdShade
 
     material = UsdShade.Material.Define(stage, target)
@@ -183,14 +193,18 @@ def _material(stage: Any, target: str, m: Material, folder: Path, colored: bool,
     preview.opacity(m, veiled)
     if m.normal_texture is not None and not m.unlit:
         s = m.normal_scale
-        node = preview.sampler("normal", m.normal_texture, "raw", (2 * s, 2 * s, 2, 1), (-s, -s, -1, 0))
+        node = preview.sampler(
+            "normal", m.normal_texture, "raw", (2 * s, 2 * s, 2, 1), (-s, -s, -1, 0)
+        )
         preview.connect("normal", "Normal3f", node, "rgb")
     if m.displacement is not None:
         d = as_16_bit(m.displacement)
         scale, bias = (d.scale,) * 3 + (1,), (-d.mid * d.scale,) * 3 + (0,)
         node = preview.sampler("displacement", d.texture, "raw", scale, bias, height_png(d))
         preview.connect("displacement", "Float", node, "r")
-        material.CreateDisplacementOutput().ConnectToSource(preview.shader.ConnectableAPI(), "displacement")
+        material.CreateDisplacementOutput().ConnectToSource(
+            preview.shader.ConnectableAPI(), "displacement"
+        )
     return material
 
 
@@ -227,11 +241,17 @@ class _Preview:
 
         file = self.folder / f"{self.target.rsplit('/', 1)[1]}_{key}.png"
         self.folder.mkdir(exist_ok=True)
-        file.write_bytes(images.encode_png(encoded_for(texture, _SPACES[space])) if data is None else data)
+        file.write_bytes(
+            images.encode_png(encoded_for(texture, _SPACES[space])) if data is None else data
+        )
         node = self._node(key, "UsdUVTexture")
-        node.CreateInput("file", self.types.Asset).Set(Sdf.AssetPath(f"./{self.folder.name}/{file.name}"))
+        node.CreateInput("file", self.types.Asset).Set(
+            Sdf.AssetPath(f"./{self.folder.name}/{file.name}")
+        )
         node.CreateInput("sourceColorSpace", self.types.Token).Set(space)
-        node.CreateInput("st", self.types.Float2).ConnectToSource(self.reader.ConnectableAPI(), "result")
+        node.CreateInput("st", self.types.Float2).ConnectToSource(
+            self.reader.ConnectableAPI(), "result"
+        )
         for axis, wrap in zip("ST", texture.wrap, strict=True):
             node.CreateInput(f"wrap{axis}", self.types.Token).Set(wrap)
         for name, value in (("scale", scale), ("bias", bias)):
@@ -244,7 +264,9 @@ class _Preview:
         source = self.shader.CreateInput(name, getattr(self.types, kind))
         source.ConnectToSource(node.ConnectableAPI(), output)
 
-    def color(self, name: str, key: str, factor: tuple[float, float, float], texture: Texture | None) -> None:
+    def color(
+        self, name: str, key: str, factor: tuple[float, float, float], texture: Texture | None
+    ) -> None:
         """A colour: a constant, or a texture times a factor."""
         from pxr import Gf
 
@@ -261,7 +283,8 @@ class _Preview:
         self.connect(name, kind, reader, "result")
 
     def reflect_nothing(self) -> None:
-        """Black in any light, but for a little at grazing angles: a UsdPreviewSurface reflects all light there."""
+        """Black in any light, but for a little at grazing angles: a UsdPreviewSurface reflects all
+        light there."""
         from pxr import Gf
 
         self.shader.CreateInput("useSpecularWorkflow", self.types.Int).Set(1)
@@ -276,15 +299,17 @@ class _Preview:
             self.shader.CreateInput("metallic", self.types.Float).Set(m.metalness)
             return
         plain = (m.roughness, m.metalness) == (1.0, 1.0)
-        node = self.sampler("orm", m.orm_texture, "raw", None if plain else (1.0, m.roughness, m.metalness, 1.0))
+        node = self.sampler(
+            "orm", m.orm_texture, "raw", None if plain else (1.0, m.roughness, m.metalness, 1.0)
+        )
         self.connect("roughness", "Float", node, "g")
         self.connect("metallic", "Float", node, "b")
         if m.has_occlusion:
             self.connect("occlusion", "Float", node, "r")
 
     def opacity(self, m: Material, veiled: bool) -> None:
-        """Coverage by the mesh's displayOpacity (``veiled``), a constant or a texture, for the alpha test if there is
-        one. A UsdPreviewSurface cannot multiply them."""
+        """Coverage by the mesh's displayOpacity (``veiled``), a constant or a texture, for the
+        alpha test if there is one. A UsdPreviewSurface cannot multiply them."""
         factor, texture = coverage(m)
         if factor == 1 and texture is None and not veiled:
             return
@@ -294,7 +319,9 @@ class _Preview:
             self.shader.CreateInput("opacity", self.types.Float).Set(factor)
         else:
             pixels = images.encode_png(encoded_for(texture, "linear", (factor,)))
-            self.connect("opacity", "Float", self.sampler("opacity", texture, "raw", data=pixels), "r")
+            self.connect(
+                "opacity", "Float", self.sampler("opacity", texture, "raw", data=pixels), "r"
+            )
         if kind_of(m) == "mask":
             self.shader.CreateInput("opacityThreshold", self.types.Float).Set(m.alpha_cutoff)
         else:  # its highlights are covered as the rest of it is, as in glTF

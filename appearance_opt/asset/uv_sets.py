@@ -1,8 +1,9 @@
-"""Textures of one material that read different sets of texture coordinates, drawn into the layout of one of them.
+"""Textures of one material that read different sets of texture coordinates, drawn into the layout
+of one of them.
 
-A texel of the new images lies on a face of the leading layout; the face says where the other sets read there. Where
-the leading layout puts several faces at one place, they share its texels, and one of them wins: the layout with the
-least of this leads.
+A texel of the new images lies on a face of the leading layout; the face says where the other sets
+read there. Where the leading layout puts several faces at one place, they share its texels, and one
+of them wins: the layout with the least of this leads.
 """
 
 from __future__ import annotations
@@ -29,7 +30,8 @@ SHARED = 0.02
 """Shares of a layout that differ by less count as equal."""
 
 DENSE = 0.95
-"""Share of the surface on which the new images have as many texels as the textures, if there is room."""
+"""Share of the surface on which the new images have as many texels as the textures, if there is
+room."""
 
 SAMPLES = 20000
 """Points of the surface at which old and new values are compared."""
@@ -41,11 +43,11 @@ def under_one_set(
     transforms: Mapping[str, UvTransform],
     most: int = MAX_TEXELS,
 ) -> Resampled | None:
-    """The textures drawn into the layout of one of their sets of coordinates, or None if the images would have more
-    than ``most`` texels.
+    """The textures drawn into the layout of one of their sets of coordinates, or None if the images
+    would have more than ``most`` texels.
 
-    ``meshes``: all that wear the material, their sets side by side
-    (``uv_transforms.UvTransform``). Texels that no face uses hold what the nearest face continues to.
+    ``meshes``: all that wear the material, their sets side by side (``uv_transforms.UvTransform``).
+    Texels that no face uses hold what the nearest face continues to.
     """
     corners, positions = _corners(meshes, transforms)
     sizes = {n: np.array(t.pixels.shape[1::-1], np.float64) for n, t in textures.items()}
@@ -67,19 +69,29 @@ def under_one_set(
     for name, texture in textures.items():
         to = _maps(corners[leading] * size - low, corners[name])
         turns = None
-        if name == "normal_texture" and transforms[name].coordinates != transforms[leading].coordinates:
+        if (
+            name == "normal_texture"
+            and transforms[name].coordinates != transforms[leading].coordinates
+        ):
             turns = _turns(positions, corners[name], corners[leading])
         new[name] = _redraw(texture, face, to, turns)
-    uvs = [((transforms[leading].of(np.asarray(m.uvs)) * size - low) / extent).astype(np.float32) for m in meshes]
+    uvs = [
+        ((transforms[leading].of(np.asarray(m.uvs)) * size - low) / extent).astype(np.float32)
+        for m in meshes
+    ]
     normal = transforms.get("normal_texture")
     turned = normal is not None and normal.coordinates != transforms[leading].coordinates
-    loss = _loss(textures, new, corners, (corners[leading] * size - low) / extent, positions, turned)
+    loss = _loss(
+        textures, new, corners, (corners[leading] * size - low) / extent, positions, turned
+    )
     return Resampled(uvs, new, f"one set, {loss}", not turned)
 
 
-def _corners(meshes: Sequence[Mesh], transforms: Mapping[str, UvTransform]) -> tuple[dict[str, NDArray], NDArray]:
-    """((F, 3, 2) places of the faces' corners in each texture, (F, 3, 3) their positions). Faces that cannot be used
-    are left out: ``repair`` has not seen them yet."""
+def _corners(
+    meshes: Sequence[Mesh], transforms: Mapping[str, UvTransform]
+) -> tuple[dict[str, NDArray], NDArray]:
+    """((F, 3, 2) places of the faces' corners in each texture, (F, 3, 3) their positions). Faces
+    that cannot be used are left out: ``repair`` has not seen them yet."""
     places: dict[str, list[NDArray]] = {n: [] for n in transforms}
     positions = []
     for mesh in meshes:
@@ -95,10 +107,12 @@ def _corners(meshes: Sequence[Mesh], transforms: Mapping[str, UvTransform]) -> t
 
 
 def _leading(
-    corners: Mapping[str, NDArray], sizes: Mapping[str, NDArray], transforms: Mapping[str, UvTransform]
+    corners: Mapping[str, NDArray],
+    sizes: Mapping[str, NDArray],
+    transforms: Mapping[str, UvTransform],
 ) -> str:
-    """The texture whose coordinates all others are drawn in: of the layout that has least at places shared by several
-    faces, there the normal map, else the finest."""
+    """The texture whose coordinates all others are drawn in: of the layout that has least at places
+    shared by several faces, there the normal map, else the finest."""
     finest = sorted(transforms, key=lambda n: (n != "normal_texture", -sizes[n].prod()))
     shared: dict[int, float] = {}
     for name in finest:
@@ -125,8 +139,8 @@ def _doubled_areas(corners: NDArray) -> NDArray:
 
 
 def _multiple(corners: Mapping[str, NDArray], sizes: Mapping[str, NDArray], leading: str) -> int:
-    """How many times as fine as the leading texture the new images must be along each side, so that nothing of the
-    others gets lost on the share ``DENSE`` of the surface."""
+    """How many times as fine as the leading texture the new images must be along each side, so that
+    nothing of the others gets lost on the share ``DENSE`` of the surface."""
     to_lead = corners[leading] * sizes[leading]
     weight = np.abs(_doubled_areas(to_lead))
     if not weight.sum() > 0:
@@ -142,8 +156,8 @@ def _multiple(corners: Mapping[str, NDArray], sizes: Mapping[str, NDArray], lead
 
 
 def _maps(source: NDArray, target: NDArray) -> NDArray[np.float64]:
-    """(F, 2, 3): for each face the affine map from the coordinates of ``source`` (F, 3, 2) to those of ``target``.
-    Faces without area in the first map to their first corner."""
+    """(F, 2, 3): for each face the affine map from the coordinates of ``source`` (F, 3, 2) to those
+    of ``target``. Faces without area in the first map to their first corner."""
     doubled = _doubled_areas(source)
     flat = np.abs(doubled) < 1e-12
     (a, b), (c, d) = ((source[:, k] - source[:, 0]).T for k in (1, 2))
@@ -161,8 +175,8 @@ def _box(placed: NDArray) -> tuple[NDArray, NDArray]:
 
 
 def _faces(corners: NDArray, extent: NDArray) -> NDArray[np.int32]:
-    """(rows, columns) the face of each texel: the one that covers its middle, else one that comes near, else the
-    nearest."""
+    """(rows, columns) the face of each texel: the one that covers its middle, else one that comes
+    near, else the nearest."""
     from scipy.ndimage import distance_transform_edt
 
     shape = int(extent[1]), int(extent[0])
@@ -175,7 +189,8 @@ def _faces(corners: NDArray, extent: NDArray) -> NDArray[np.int32]:
 
 
 def _drawn_faces(corners: NDArray, shape: tuple[int, int], margin: float) -> NDArray[np.int32]:
-    """(rows, columns) the last face that comes within ``margin`` of a texel's middle along its row or column, or -1."""
+    """(rows, columns) the last face that comes within ``margin`` of a texel's middle along its row
+    or column, or -1."""
     out = np.full(shape, -1, np.int32)
     low, high = corners.min(axis=1), corners.max(axis=1)
     first = np.clip(np.ceil(low[:, 1] - 0.5 - margin), 0, shape[0]).astype(np.int64)
@@ -184,13 +199,23 @@ def _drawn_faces(corners: NDArray, shape: tuple[int, int], margin: float) -> NDA
     start = 0
     while start < len(corners):
         end = max(start + 1, int(np.searchsorted(cost, (cost[start - 1] if start else 0) + BAND)))
-        _draw(out, corners[start:end], first[start:end], np.maximum(rows[start:end], 0), margin, start)
+        _draw(
+            out, corners[start:end], first[start:end], np.maximum(rows[start:end], 0), margin, start
+        )
         start = end
     return out
 
 
-def _draw(out: NDArray[np.int32], corners: NDArray, first: NDArray, rows: NDArray, margin: float, number: int) -> None:
-    """Write the numbers of faces, from ``number`` on, into the texels of their ``rows`` rows from ``first`` on."""
+def _draw(
+    out: NDArray[np.int32],
+    corners: NDArray,
+    first: NDArray,
+    rows: NDArray,
+    margin: float,
+    number: int,
+) -> None:
+    """Write the numbers of faces, from ``number`` on, into the texels of their ``rows`` rows from
+    ``first`` on."""
     face, y = _counted(rows)
     y = y + first[face]
     p = corners[face]
@@ -206,8 +231,12 @@ def _draw(out: NDArray[np.int32], corners: NDArray, first: NDArray, rows: NDArra
             left = np.where(meets, np.minimum(left, end), left)
             right = np.where(meets, np.maximum(right, end), right)
     met = left <= right  # not for what the rounding of t leaves out
-    begin = np.clip(np.ceil(np.where(met, left, 0) - 0.5 - margin), 0, out.shape[1]).astype(np.int64)
-    end_ = np.clip(np.floor(np.where(met, right, -1) - 0.5 + margin) + 1, 0, out.shape[1]).astype(np.int64)
+    begin = np.clip(np.ceil(np.where(met, left, 0) - 0.5 - margin), 0, out.shape[1]).astype(
+        np.int64
+    )
+    end_ = np.clip(np.floor(np.where(met, right, -1) - 0.5 + margin) + 1, 0, out.shape[1]).astype(
+        np.int64
+    )
     span, x = _counted(np.maximum(end_ - begin, 0))
     out[y[span], x + begin[span]] = face[span] + number
 
@@ -223,11 +252,14 @@ def _turns(positions: NDArray, own: NDArray, leading: NDArray) -> NDArray[np.flo
     normal = np.cross(positions[:, 1] - positions[:, 0], positions[:, 2] - positions[:, 0])
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
     (t, b), (u, v) = (_tangents(positions, uv, normal) for uv in (own, leading))
-    return np.stack([np.stack([_dot(u, t), _dot(u, b)], 1), np.stack([_dot(v, t), _dot(v, b)], 1)], axis=1)
+    return np.stack(
+        [np.stack([_dot(u, t), _dot(u, b)], 1), np.stack([_dot(v, t), _dot(v, b)], 1)], axis=1
+    )
 
 
 def _tangents(positions: NDArray, uvs: NDArray, normal: NDArray) -> tuple[NDArray, NDArray]:
-    """Unit tangents and bitangents (F, 3); these point against v, which grows downward, as green points up."""
+    """Unit tangents and bitangents (F, 3); these point against v, which grows downward, as green
+    points up."""
     edges = np.stack([positions[:, 1] - positions[:, 0], positions[:, 2] - positions[:, 0]], axis=2)
     doubled = _doubled_areas(uvs)[:, None]
     (a, b), (c, d) = ((uvs[:, k] - uvs[:, 0]).T for k in (1, 2))
@@ -244,7 +276,8 @@ def _dot(a: NDArray, b: NDArray) -> NDArray:
 
 
 def _redraw(texture: Texture, face: NDArray, to: NDArray, turns: NDArray | None) -> Texture:
-    """The texture in the layout of ``face``; ``to``: the map (F, 2, 3) of each face from texels to where it reads."""
+    """The texture in the layout of ``face``; ``to``: the map (F, 2, 3) of each face from texels to
+    where it reads."""
     rows, columns = face.shape
     out = np.empty((rows, columns, texture.pixels.shape[2]), texture.pixels.dtype)
     whole = float(np.iinfo(out.dtype).max) if out.dtype.kind == "u" else 1.0
@@ -274,7 +307,9 @@ def _loss(
 ) -> str:
     """How far the new textures are from the old ones, on average over points of the surface."""
     rng = np.random.default_rng(0)
-    area = np.linalg.norm(np.cross(positions[:, 1] - positions[:, 0], positions[:, 2] - positions[:, 0]), axis=1)
+    area = np.linalg.norm(
+        np.cross(positions[:, 1] - positions[:, 0], positions[:, 2] - positions[:, 0]), axis=1
+    )
     if not area.sum() > 0:
         return "on faces without area"
     face = rng.choice(len(area), SAMPLES, p=area / area.sum())
@@ -289,9 +324,12 @@ def _loss(
             bilinear(t, np.einsum("nk,nki->ni", weight, c[face]))
             for t, c in ((texture, corners[name]), (new[name], placed))
         )
-        whole = float(np.iinfo(texture.pixels.dtype).max) if texture.pixels.dtype.kind == "u" else 1.0
+        whole = (
+            float(np.iinfo(texture.pixels.dtype).max) if texture.pixels.dtype.kind == "u" else 1.0
+        )
         rms = float(np.sqrt(np.mean(((before - after) / whole) ** 2)))
         errors.append((rms, name.replace("_texture", "").replace("_", " ")))
     return ", ".join(
-        f"{what} " + (f"within {100 * rms:.2g} % (RMS)" if rms > 1e-5 else "as it was") for rms, what in errors
+        f"{what} " + (f"within {100 * rms:.2g} % (RMS)" if rms > 1e-5 else "as it was")
+        for rms, what in errors
     )

@@ -14,7 +14,8 @@ if TYPE_CHECKING:
 
 
 def affine(transform: Mapping[str, Any] | None) -> NDArray[np.float64]:
-    """(2, 3) matrix of KHR_texture_transform: offset, then rotation, then scale, as the extension composes them."""
+    """(2, 3) matrix of KHR_texture_transform: offset, then rotation, then scale, as the extension
+    composes them."""
     t = transform or {}
     angle = float(t.get("rotation", 0.0))
     c, s = np.cos(angle), np.sin(angle)
@@ -22,9 +23,11 @@ def affine(transform: Mapping[str, Any] | None) -> NDArray[np.float64]:
     return np.concatenate([linear, np.array(t.get("offset", (0, 0)), np.float64)[:, None]], axis=1)
 
 
-def usd_affine(scale: Sequence[float], rotation: float, translation: Sequence[float]) -> NDArray[np.float64]:
-    """(2, 3) matrix of UsdTransform2d (scale, then rotation in degrees, then translation), which counts v upward, for
-    coordinates that count it downward."""
+def usd_affine(
+    scale: Sequence[float], rotation: float, translation: Sequence[float]
+) -> NDArray[np.float64]:
+    """(2, 3) matrix of UsdTransform2d (scale, then rotation in degrees, then translation), which
+    counts v upward, for coordinates that count it downward."""
     angle = np.radians(rotation)
     c, s = np.cos(angle), np.sin(angle)
     (a, b), (p, q) = np.array([[c, -s], [s, c]]) @ np.diag(np.array(scale, np.float64))
@@ -33,7 +36,9 @@ def usd_affine(scale: Sequence[float], rotation: float, translation: Sequence[fl
 
 def compose(then: NDArray, first: NDArray) -> NDArray[np.float64]:
     """(2, 3) matrix of two transforms after each other."""
-    return np.concatenate([then[:, :2] @ first[:, :2], (then[:, :2] @ first[:, 2] + then[:, 2])[:, None]], axis=1)
+    return np.concatenate(
+        [then[:, :2] @ first[:, :2], (then[:, :2] @ first[:, 2] + then[:, 2])[:, None]], axis=1
+    )
 
 
 def apply(matrix: NDArray, points: NDArray) -> NDArray[np.float64]:
@@ -43,7 +48,8 @@ def apply(matrix: NDArray, points: NDArray) -> NDArray[np.float64]:
 
 @dataclass(frozen=True)
 class UvTransform:
-    """Where a texture reads: at ``matrix`` (2, 3) times the coordinates of the set number ``coordinates``.
+    """Where a texture reads: at ``matrix`` (2, 3) times the coordinates of the set number
+    ``coordinates``.
 
     Until ``uv_unification.unify``, meshes whose material reads several sets hold them side by side
     in ``uvs``: (V, 2 * sets).
@@ -73,7 +79,9 @@ class Place:
 
 
 def stack_sets(sets: Sequence[NDArray | None]) -> NDArray | None:
-    """Sets of texture coordinates (V, 2) side by side; what a mesh lacks is taken from the first that it has. None if
-    it has none of them."""
+    """Sets of texture coordinates (V, 2) side by side; what a mesh lacks is taken from the first
+    that it has. None if it has none of them."""
     there = next((s for s in sets if s is not None), None)
-    return None if there is None else np.concatenate([there if s is None else s for s in sets], axis=1)
+    return (
+        None if there is None else np.concatenate([there if s is None else s for s in sets], axis=1)
+    )

@@ -1,8 +1,10 @@
-"""Textures of one material under transforms or wrap modes that differ, resampled so that they share them.
+"""Textures of one material under transforms or wrap modes that differ, resampled so that they share
+them.
 
-A material here has one set of texture coordinates, one transform and one wrap mode. Where a file says otherwise, each
-texture is drawn into an image that spans the coordinates which the meshes use, and the coordinates are moved there.
-``uv_sets`` does this for textures that read different sets of coordinates.
+A material here has one set of texture coordinates, one transform and one wrap mode. Where a file
+says otherwise, each texture is drawn into an image that spans the coordinates which the meshes use,
+and the coordinates are moved there. ``uv_sets`` does this for textures that read different sets of
+coordinates.
 """
 
 from __future__ import annotations
@@ -27,7 +29,8 @@ if TYPE_CHECKING:
     from appearance_opt.asset.uv_transforms import UvTransform
 
 ASSET_TEXELS = 1 << 27
-"""Texels of all resampled textures of an asset at most: a small picture, repeated often, may stand for any number."""
+"""Texels of all resampled textures of an asset at most: a small picture, repeated often, may stand
+for any number."""
 
 
 def apply_all(
@@ -37,24 +40,32 @@ def apply_all(
     tiles: Mapping[int, Callable[[Tile], Material]],
     keep_layout: bool,
 ) -> list[Mesh]:
-    """What a reader's meshes become: taken apart into the ``tiles`` of their textures (``udim.split``), then
-    ``unify``; or all as it is (``keep_layout``: see ``asset.load``)."""
+    """What a reader's meshes become: taken apart into the ``tiles`` of their textures
+    (``udim.split``), then ``unify``; or all as it is (``keep_layout``: see ``asset.load``)."""
     if keep_layout:
         return keep_first_sets(meshes, transforms_of, note)
-    return unify(udim.split(meshes, tiles, transforms_of, note) if tiles else meshes, transforms_of, note)
+    return unify(
+        udim.split(meshes, tiles, transforms_of, note) if tiles else meshes, transforms_of, note
+    )
 
 
 def unify(
-    meshes: Sequence[Mesh], transforms_of: Mapping[int, Mapping[str, UvTransform]], note: Callable[[str], None]
+    meshes: Sequence[Mesh],
+    transforms_of: Mapping[int, Mapping[str, UvTransform]],
+    note: Callable[[str], None],
 ) -> list[Mesh]:
-    """The meshes with the transforms of their textures applied, and textures brought under one set of coordinates, one
-    transform and one wrap mode where they differ. ``transforms_of``: by ``id`` of a material, the
-    transform of each of its textures by field name; materials that are not there stay.
-    ``note``: told what was resampled."""
+    """The meshes with the transforms of their textures applied, and textures brought under one set
+    of coordinates, one transform and one wrap mode where they differ. ``transforms_of``: by ``id``
+    of a material, the transform of each of its textures by field name; materials that are not there
+    stay. ``note``: told what was resampled."""
     out, left = list(meshes), ASSET_TEXELS
     for own in _by_material(meshes):
         material = meshes[own[0]].material
-        transforms = {n: f for n, f in transforms_of.get(id(material), {}).items() if getattr(material, n) is not None}
+        transforms = {
+            n: f
+            for n, f in transforms_of.get(id(material), {}).items()
+            if getattr(material, n) is not None
+        }
         if not transforms:
             for k in own:
                 out[k] = _first_set(meshes[k])
@@ -71,7 +82,9 @@ def unify(
             differ = "transform or wrap mode"
         if differ:
             told = f"material '{material.name}': its textures differ in {differ}"
-            found = _resample_alike(told, [meshes[k] for k in own], textures, transforms, left, note)
+            found = _resample_alike(
+                told, [meshes[k] for k in own], textures, transforms, left, note
+            )
             if found is not None:
                 left -= sum(t.pixels.shape[0] * t.pixels.shape[1] for t in found.textures.values())
                 placed, new = found.uvs, replace(material, **found.textures)  # type: ignore[arg-type]
@@ -92,11 +105,16 @@ def _by_material(meshes: Sequence[Mesh]) -> list[list[int]]:
 
 
 def _first_set(mesh: Mesh) -> Mesh:
-    return mesh if mesh.uvs is None or mesh.uvs.shape[1] == 2 else replace(mesh, uvs=mesh.uvs[:, :2])
+    return (
+        mesh if mesh.uvs is None or mesh.uvs.shape[1] == 2 else replace(mesh, uvs=mesh.uvs[:, :2])
+    )
 
 
-def _where_sets_differ(uvs: Sequence[NDArray], transforms: Mapping[str, UvTransform]) -> dict[str, UvTransform]:
-    """The transforms, on as few sets as there are different ones: many files repeat their only set."""
+def _where_sets_differ(
+    uvs: Sequence[NDArray], transforms: Mapping[str, UvTransform]
+) -> dict[str, UvTransform]:
+    """The transforms, on as few sets as there are different ones: many files repeat their only
+    set."""
     used = list(dict.fromkeys(f.coordinates for f in transforms.values()))
     same: dict[int, int] = {}
     for k in used:
@@ -106,7 +124,9 @@ def _where_sets_differ(uvs: Sequence[NDArray], transforms: Mapping[str, UvTransf
 
 
 def _columns_equal(uvs: NDArray, first: int, second: int) -> bool:
-    return bool(np.array_equal(uvs[:, 2 * first : 2 * first + 2], uvs[:, 2 * second : 2 * second + 2]))
+    return bool(
+        np.array_equal(uvs[:, 2 * first : 2 * first + 2], uvs[:, 2 * second : 2 * second + 2])
+    )
 
 
 def _resample_alike(
@@ -117,15 +137,17 @@ def _resample_alike(
     most: int,
     note: Callable[[str], None],
 ) -> Resampled | None:
-    """The textures of ``meshes`` under one transform, or None if each would be too large, or all together larger than
-    ``most`` texels; ``note`` is told, after ``told``."""
+    """The textures of ``meshes`` under one transform, or None if each would be too large, or all
+    together larger than ``most`` texels; ``note`` is told, after ``told``."""
     each = min(MAX_TEXELS, most // len(textures))
     if len({f.coordinates for f in transforms.values()}) > 1:
         found = under_one_set(meshes, textures, transforms, each)
     else:
         # tangents follow the coordinates, and the normal map follows the tangents
         leading = "normal_texture" if "normal_texture" in textures else next(iter(textures))
-        found = under_one_transform([np.asarray(m.uvs) for m in meshes], textures, transforms, leading, each)
+        found = under_one_transform(
+            [np.asarray(m.uvs) for m in meshes], textures, transforms, leading, each
+        )
     if found is None:
         note(f"{told}, and are too large to be resampled: the first one's are used for all")
     else:
@@ -134,15 +156,22 @@ def _resample_alike(
 
 
 def keep_first_sets(
-    meshes: Sequence[Mesh], transforms_of: Mapping[int, Mapping[str, UvTransform]], note: Callable[[str], None]
+    meshes: Sequence[Mesh],
+    transforms_of: Mapping[int, Mapping[str, UvTransform]],
+    note: Callable[[str], None],
 ) -> list[Mesh]:
-    """The meshes with the first set of texture coordinates that their materials read, as it is, for ``keep_layout`` of
-    ``asset.load``; ``note`` is told whose textures would have been moved. Parameters as for ``unify``."""
+    """The meshes with the first set of texture coordinates that their materials read, as it is, for
+    ``keep_layout`` of ``asset.load``; ``note`` is told whose textures would have been moved.
+    Parameters as for ``unify``."""
     for material in {id(m.material): m.material for m in meshes}.values():
         transforms = transforms_of.get(id(material), {})
-        unmoved = (np.allclose(f.matrix, affine(None)) and f.coordinates == 0 for f in transforms.values())
+        unmoved = (
+            np.allclose(f.matrix, affine(None)) and f.coordinates == 0 for f in transforms.values()
+        )
         moved = [
-            n for n, still in zip(transforms, unmoved, strict=True) if getattr(material, n) is not None and not still
+            n
+            for n, still in zip(transforms, unmoved, strict=True)
+            if getattr(material, n) is not None and not still
         ]
         if moved:
             which = ", ".join(n.replace("_texture", "").replace("_", " ") for n in moved)
@@ -151,11 +180,16 @@ def keep_first_sets(
     return [_first_set(m) for m in meshes]
 
 
-def alike(uvs: Sequence[NDArray], textures: Mapping[str, Texture], transforms: Mapping[str, UvTransform]) -> bool:
-    """Can the textures, of one set, share the first one's transform and wrap mode? Wrap modes do not matter within the
-    image."""
+def alike(
+    uvs: Sequence[NDArray], textures: Mapping[str, Texture], transforms: Mapping[str, UvTransform]
+) -> bool:
+    """Can the textures, of one set, share the first one's transform and wrap mode? Wrap modes do
+    not matter within the image."""
     first = next(iter(transforms.values()))
-    if any(not np.allclose(transform.matrix, first.matrix, atol=1e-9) for transform in transforms.values()):
+    if any(
+        not np.allclose(transform.matrix, first.matrix, atol=1e-9)
+        for transform in transforms.values()
+    ):
         return False
     if len({mode for t in textures.values() for mode in t.wrap}) == 1:
         return True
@@ -170,22 +204,25 @@ def under_one_transform(
     leading: str,
     most: int = MAX_TEXELS,
 ) -> Resampled | None:
-    """Textures that read the same set of coordinates under one transform, or None if the images would have more than
-    ``most`` texels.
+    """Textures that read the same set of coordinates under one transform, or None if the images
+    would have more than ``most`` texels.
 
-    ``transforms``: those of the textures, on one set of coordinates. ``leading``: the texture
-    whose transform the others are brought to; where it is the finest, it is copied texel by texel.
-    The others are read bilinearly.
+    ``transforms``: those of the textures, on one set of coordinates. ``leading``: the texture whose
+    transform the others are brought to; where it is the finest, it is copied texel by texel. The
+    others are read bilinearly.
     """
     transform = transforms[leading].matrix
     if min(abs(np.linalg.det(f.matrix[:, :2])) for f in transforms.values()) < 1e-12:
         return None
     height, width = textures[leading].pixels.shape[:2]
     back = np.linalg.inv(transform[:, :2])
-    # enough texels for the finest of them, in whole multiples so that the leading one's texels stay texels
+    # enough texels for the finest of them, in whole multiples so that the leading one's texels stay
+    # texels
     finer = 1.0
     for name, texture in textures.items():
-        step = transforms[name].matrix[:, :2] @ back * np.array(texture.pixels.shape[1::-1])[:, None]
+        step = (
+            transforms[name].matrix[:, :2] @ back * np.array(texture.pixels.shape[1::-1])[:, None]
+        )
         finer = max(finer, *(np.linalg.norm(step, axis=0) / (width, height)))
     size = np.array([width, height]) * int(np.ceil(finer - 1e-6))
     placed = [transforms[leading].of(uv) * size for uv in uvs]
@@ -194,12 +231,19 @@ def under_one_transform(
     if not extent.prod() <= most:  # nor for coordinates that are no numbers
         return None
     to_uv = np.concatenate([back, -back @ transform[:, 2:]], axis=1)
-    new = {n: _resample(t, transforms[n].matrix, to_uv, low, size, extent) for n, t in textures.items()}
+    new = {
+        n: _resample(t, transforms[n].matrix, to_uv, low, size, extent) for n, t in textures.items()
+    }
     return Resampled([((p - low) / extent).astype(np.float32) for p in placed], new)
 
 
 def _resample(
-    texture: Texture, transform: NDArray, to_uv: NDArray, low: NDArray, size: NDArray, extent: NDArray
+    texture: Texture,
+    transform: NDArray,
+    to_uv: NDArray,
+    low: NDArray,
+    size: NDArray,
+    extent: NDArray,
 ) -> Texture:
     columns, rows = int(extent[0]), int(extent[1])
     out = np.empty((rows, columns, texture.pixels.shape[2]), texture.pixels.dtype)

@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     from appearance_opt.asset.types import Material
 
 MAX_UV = 65536.0
-"""Texture coordinates farther from the unit square than this have no fraction left in single precision that
-could address a texel."""
+"""Texture coordinates farther from the unit square than this have no fraction left in single
+precision that could address a texel."""
 
 LIMITS: dict[str, tuple[float, float]] = {"uvs": (-MAX_UV, MAX_UV), "colors": (0.0, 1.0)}
 """Least and greatest values of attributes that mean something."""
@@ -32,7 +32,10 @@ LIMITS: dict[str, tuple[float, float]] = {"uvs": (-MAX_UV, MAX_UV), "colors": (0
 REASONS = 5
 """Notes that an error repeats."""
 
-FILLED: dict[str, tuple[float, str]] = {"uvs": (0.0, "texture coordinates"), "colors": (1.0, "vertex colours")}
+FILLED: dict[str, tuple[float, str]] = {
+    "uvs": (0.0, "texture coordinates"),
+    "colors": (1.0, "vertex colours"),
+}
 """What stands for numbers that are none, and how notes call the attributes."""
 
 BAND = 1 << 18
@@ -41,7 +44,8 @@ BAND = 1 << 18
 
 @dataclass(frozen=True)
 class Validation:
-    """Counts over all meshes of an asset. Edges and parts are counted on the welded positions of each mesh."""
+    """Counts over all meshes of an asset. Edges and parts are counted on the welded positions of
+    each mesh."""
 
     triangles: int = 0
     non_finite_positions: int = 0
@@ -58,33 +62,47 @@ class Validation:
 
 
 def repair_and_count(asset: Asset, path: str) -> tuple[Validation, Asset]:
-    """(counts, the asset after ``repair``): of what that mends as it is in the file, of all else as it is left."""
+    """(counts, the asset after ``repair``): of what that mends as it is in the file, of all else as
+    it is left."""
     mended = repair(asset, path)
     found, left = validate(asset), mended.meshes
-    if len(left) < len(asset.meshes) or any(_reshaped(m, n) for m, n in zip(asset.meshes, left, strict=True)):
+    if len(left) < len(asset.meshes) or any(
+        _reshaped(m, n) for m, n in zip(asset.meshes, left, strict=True)
+    ):
         found = replace(validate(mended), **{name: getattr(found, name) for name in _MENDED})
     return found, mended
 
 
 def _reshaped(mesh: Mesh, mended: Mesh) -> bool:
-    return any(getattr(mesh, name) is not getattr(mended, name) for name in ("positions", "faces", "uvs"))
+    return any(
+        getattr(mesh, name) is not getattr(mended, name) for name in ("positions", "faces", "uvs")
+    )
 
 
-_MENDED = ("non_finite_positions", "indices_out_of_range", "degenerate_faces", "unreferenced_vertices")
+_MENDED = (
+    "non_finite_positions",
+    "indices_out_of_range",
+    "degenerate_faces",
+    "unreferenced_vertices",
+)
 
 
 def validate(asset: Asset) -> Validation:
     """Count what is wrong. Changes nothing."""
     batch = Batch(asset.meshes)
     positions = batch.joined("positions")
-    bad_index = (batch.own_faces < 0) | (batch.own_faces >= batch.vertex_counts[batch.mesh_of_face][:, None])
+    bad_index = (batch.own_faces < 0) | (
+        batch.own_faces >= batch.vertex_counts[batch.mesh_of_face][:, None]
+    )
     faces = batch.faces[~bad_index.any(axis=1)]
     used = np.zeros(len(positions), bool)
     used[faces] = True
     # vertices of different meshes stay apart
     first, place = weld(apart(positions, batch.mesh_of_vertex))
     welded = place[faces]
-    edges, uses = _counted(np.sort(welded[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1), len(first))
+    edges, uses = _counted(
+        np.sort(welded[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1), len(first)
+    )
     return Validation(
         triangles=len(batch.own_faces),
         non_finite_positions=int((~np.isfinite(positions).all(axis=1)).sum()),
@@ -131,13 +149,14 @@ def _parts(edges: NDArray, faces: NDArray, vertices: int) -> int:
 
 
 def repair(asset: Asset, source: str) -> Asset:
-    """The asset with harmless faults mended, and a note for each kind. ``source`` names it in errors.
+    """The asset with harmless faults mended, and a note for each kind. ``source`` names it in
+    errors.
 
     Dropped: degenerate faces, unreferenced vertices, empty meshes. Recomputed: normals that are not
-    finite or zero. Clamped: texture coordinates, colours and factors beyond their range. Opaque: what only speaks
-    of transparency (``alpha.separate_opaque``). Raises InputError
-    for positions, texture coordinates or factors that are not finite, attributes that do not fit the
-    positions, indices out of range, and when no face is left.
+    finite or zero. Clamped: texture coordinates, colours and factors beyond their range. Opaque:
+    what only speaks of transparency (``alpha.separate_opaque``). Raises InputError for positions,
+    texture coordinates or factors that are not finite, attributes that do not fit the positions,
+    indices out of range, and when no face is left.
     """
     notes = Notes()
     found = zip(asset.meshes, _suspects(asset.meshes), strict=True)
@@ -150,16 +169,21 @@ def repair(asset: Asset, source: str) -> Asset:
     materials = {id(m.material): m.material for m in meshes}
     mended = {key: repair_material(m, source, notes) for key, m in materials.items()}
     new = [mended[id(m.material)] for m in meshes]
-    meshes = [m if m.material is n else replace(m, material=n) for m, n in zip(meshes, new, strict=True)]
+    meshes = [
+        m if m.material is n else replace(m, material=n) for m, n in zip(meshes, new, strict=True)
+    ]
     return separate_opaque(replace(asset, meshes=tuple(meshes), notes=asset.notes + notes.lines()))
 
 
 def _suspects(meshes: Sequence[Mesh]) -> NDArray[np.bool_]:
-    """(M,) which meshes may have a fault that ``_repair`` looks for? Asked of all at once: most have none."""
+    """(M,) which meshes may have a fault that ``_repair`` looks for? Asked of all at once: most
+    have none."""
     unfit = np.array([_misshapen(m) for m in meshes], bool)
     fit = np.flatnonzero(~unfit)
     batch = Batch([meshes[k] for k in fit.tolist()])
-    out_of_range = (batch.own_faces < 0) | (batch.own_faces >= batch.vertex_counts[batch.mesh_of_face][:, None])
+    out_of_range = (batch.own_faces < 0) | (
+        batch.own_faces >= batch.vertex_counts[batch.mesh_of_face][:, None]
+    )
     unfit[fit[batch.mesh_of_face[out_of_range.any(axis=1)]]] = True
     fit = np.flatnonzero(~unfit)
     batch = Batch([meshes[k] for k in fit.tolist()])
@@ -173,7 +197,11 @@ def _suspects(meshes: Sequence[Mesh]) -> NDArray[np.bool_]:
     lengths = {"normals": np.linalg.norm(batch.joined("normals"), axis=1)}
     lengths["tangents"] = np.linalg.norm(batch.joined("tangents")[:, :3], axis=1)
     for name, length in lengths.items():
-        close = np.abs(length - 1) <= 1e-3 if name == "normals" else (length >= 1e-6) & np.isfinite(length)
+        close = (
+            np.abs(length - 1) <= 1e-3
+            if name == "normals"
+            else (length >= 1e-6) & np.isfinite(length)
+        )
         wrong |= ~close & batch.have(name)[batch.mesh_of_vertex]
     unfit[fit[batch.mesh_of_vertex[wrong]]] = True
     unfit[fit[batch.mesh_of_face[_degenerate(positions, batch.faces)]]] = True
@@ -184,7 +212,10 @@ def _misshapen(mesh: Mesh) -> bool:
     """Has a mesh attributes that do not fit its positions, or tangents without normals?"""
     count = len(mesh.positions)
     given = ((getattr(mesh, name), widths) for name, widths in WIDTHS.items())
-    fits = all(v is None or (v.ndim == 2 and len(v) == count and v.shape[1] in widths) for v, widths in given)
+    fits = all(
+        v is None or (v.ndim == 2 and len(v) == count and v.shape[1] in widths)
+        for v, widths in given
+    )
     return not fits or (mesh.tangents is not None and mesh.normals is None)
 
 
@@ -197,7 +228,9 @@ def _repair(mesh: Mesh, source: str, notes: Notes) -> Mesh:
         )
     for name, widths in WIDTHS.items():
         values = getattr(mesh, name)
-        if values is not None and values.shape not in [(len(mesh.positions), width) for width in widths]:
+        if values is not None and values.shape not in [
+            (len(mesh.positions), width) for width in widths
+        ]:
             raise InputError(
                 f"{source}, mesh '{mesh.name}': its {name} are {values.shape} numbers for {len(mesh.positions)} "
                 "positions; export it again"
@@ -205,16 +238,22 @@ def _repair(mesh: Mesh, source: str, notes: Notes) -> Mesh:
     used = np.unique(mesh.faces)
     broken = int((~np.isfinite(mesh.positions[used])).any(axis=1).sum())
     if broken:
-        raise InputError(f"{source}, mesh '{mesh.name}': {broken} positions are NaN or infinite; export it again")
+        raise InputError(
+            f"{source}, mesh '{mesh.name}': {broken} positions are NaN or infinite; export it again"
+        )
     for name, (value, what) in FILLED.items():
         given = getattr(mesh, name)
         if given is None or np.isfinite(given).all():
             continue
         lost = ~np.isfinite(given).all(axis=1)
         if lost[used].all():
-            raise InputError(f"{source}, mesh '{mesh.name}': its {what} are NaN or infinite; export it again")
+            raise InputError(
+                f"{source}, mesh '{mesh.name}': its {what} are NaN or infinite; export it again"
+            )
         if lost[used].any():
-            notes(f"mesh '{mesh.name}': {int(lost[used].sum())} {what} that are no numbers set to {value:g}")
+            notes(
+                f"mesh '{mesh.name}': {int(lost[used].sum())} {what} that are no numbers set to {value:g}"
+            )
         mesh = replace(mesh, **{name: np.where(lost[:, None], np.float32(value), given)})
     degenerate = _degenerate(mesh.positions, mesh.faces)
     if degenerate.any():
@@ -222,7 +261,9 @@ def _repair(mesh: Mesh, source: str, notes: Notes) -> Mesh:
         mesh = replace(mesh, faces=mesh.faces[~degenerate])
         used = np.unique(mesh.faces)
     if len(used) < len(mesh.positions):
-        notes(f"mesh '{mesh.name}': {len(mesh.positions) - len(used)} unreferenced vertices dropped")
+        notes(
+            f"mesh '{mesh.name}': {len(mesh.positions) - len(used)} unreferenced vertices dropped"
+        )
         mesh = _compact(mesh, used)
     return _repair_normals(_repair_ranges(mesh, notes), notes)
 
@@ -240,8 +281,19 @@ def _repair_ranges(mesh: Mesh, notes: Notes) -> Mesh:
 def repair_material(material: Material, source: str, notes: Notes) -> Material:
     """The material with factors and float texels within [0, 1], and a note if they were not. Raises
     InputError for factors that are not numbers."""
-    factors = (*material.base_color, material.roughness, material.metalness, material.opacity, material.transmission)
-    others: tuple[float, ...] = (material.normal_scale, *material.emission, material.alpha_cutoff, material.ior)
+    factors = (
+        *material.base_color,
+        material.roughness,
+        material.metalness,
+        material.opacity,
+        material.transmission,
+    )
+    others: tuple[float, ...] = (
+        material.normal_scale,
+        *material.emission,
+        material.alpha_cutoff,
+        material.ior,
+    )
     unknown = False
     if material.volume is not None:
         others = (*others, material.volume.thickness, *material.volume.attenuation_color)
@@ -259,13 +311,21 @@ def repair_material(material: Material, source: str, notes: Notes) -> Material:
         r, g, b, roughness, metalness, opacity, through = (min(max(f, 0.0), 1.0) for f in factors)
         material = replace(material, base_color=(r, g, b), roughness=roughness, metalness=metalness)
         material = replace(material, opacity=opacity, transmission=through)
-    for name in ("base_color_texture", "orm_texture", "normal_texture", "transmission_texture", "thickness_texture"):
+    for name in (
+        "base_color_texture",
+        "orm_texture",
+        "normal_texture",
+        "transmission_texture",
+        "thickness_texture",
+    ):
         texture = getattr(material, name)
         if texture is None or texture.pixels.dtype.kind != "f":
             continue
         if texture.pixels.min() < 0 or texture.pixels.max() > 1:
             notes(f"material '{material.name}': values of its {name} outside of 0 to 1 clamped")
-            material = replace(material, **{name: replace(texture, pixels=np.clip(texture.pixels, 0, 1))})
+            material = replace(
+                material, **{name: replace(texture, pixels=np.clip(texture.pixels, 0, 1))}
+            )
     return material
 
 

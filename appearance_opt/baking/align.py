@@ -25,8 +25,8 @@ KEPT = 0.8
 def align(moving: Asset, still: Asset) -> tuple[Asset, float, NDArray[np.float64]]:
     """(the moving asset in its new place, scale, translation): x -> scale * x + translation.
 
-    Starts from the bounding boxes; then iterated closest points with point-to-plane distances (Chen and
-    Medioni 1991), trimmed (Chetverikov et al. 2002). Rotation is never changed.
+    Starts from the bounding boxes; then iterated closest points with point-to-plane distances (Chen
+    and Medioni 1991), trimmed (Chetverikov et al. 2002). Rotation is never changed.
     """
     from scipy.spatial import cKDTree
 
@@ -47,7 +47,9 @@ def align(moving: Asset, still: Asset) -> tuple[Asset, float, NDArray[np.float64
         q, n, x = source[nearest[keep]], normals[nearest[keep]], target[keep]
         # growth about the middle of the points, and a shift, in units of the object's size
         middle = q.mean(axis=0)
-        matrix = np.concatenate([np.sum(n * (q - middle), axis=1, keepdims=True) * scale / size, n], axis=1)
+        matrix = np.concatenate(
+            [np.sum(n * (q - middle), axis=1, keepdims=True) * scale / size, n], axis=1
+        )
         residual = np.sum(n * (x - scale * q - shift), axis=1) / size
         step = np.linalg.lstsq(matrix, residual, rcond=1e-6)[0]
         growth = float(np.clip(step[0], -0.2, 0.2))
@@ -55,13 +57,17 @@ def align(moving: Asset, still: Asset) -> tuple[Asset, float, NDArray[np.float64
         scale *= 1 + growth
         if np.abs(step).max() < 1e-9:
             break
-    points = [(m.positions.astype(np.float64) + moving_origin) * scale + shift for m in moving.meshes]
+    points = [
+        (m.positions.astype(np.float64) + moving_origin) * scale + shift for m in moving.meshes
+    ]
     placed = [p.astype(np.float32) for p in points]
     meshes = tuple(replace(m, positions=p) for m, p in zip(moving.meshes, placed, strict=True))
     return replace(moving, meshes=meshes, origin=still.origin), scale, shift + (1 - scale) * origin
 
 
-def _surface_points(asset: Asset, count: int, seed: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _surface_points(
+    asset: Asset, count: int, seed: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """(count, 3) points spread evenly over the surface, and the normals of their triangles."""
     p = np.concatenate([m.positions[m.faces] for m in asset.meshes]).astype(np.float64)
     cross = np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0])

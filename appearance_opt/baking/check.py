@@ -21,30 +21,36 @@ OUTSIDE = 1e-5
 """How far texture coordinates may lie outside the unit square: exporters round."""
 
 NO_AREA, NO_SURFACE = 1e-12, 1e-6
-"""UV area (fraction of the square) that counts as none, and the share of the surface that such triangles
-may have: slivers without area in space may well have none in the atlas."""
+"""UV area (fraction of the square) that counts as none, and the share of the surface that such
+triangles may have: slivers without area in space may well have none in the atlas."""
 
 OVERLAP_SIZE, OVERLAP_MARGIN, OVERLAP_SHARE = 2048, 0.05, 1e-3
-"""Overlaps are looked for on a grid of this many points a side; a point counts for a triangle if it lies
-this far inside, in grid cells; fewer overlapping points than this share of the covered ones are rounding, or the
-folded slivers that automatic atlases leave (1.5e-4 in xatlas's of the demo's 8,999 triangles)."""
+"""Overlaps are looked for on a grid of this many points a side; a point counts for a triangle if it
+lies this far inside, in grid cells; fewer overlapping points than this share of the covered ones
+are rounding, or the folded slivers that automatic atlases leave (1.5e-4 in xatlas's of the demo's
+8,999 triangles)."""
 
 MENDING = "use --unwrap to make a new atlas"
 
 
 def check_uvs(asset: Asset, name: str) -> None:
-    """Raise InputError for texture coordinates that are missing, outside the unit square, or without
-    area. ``name``: how to call the file."""
+    """Raise InputError for texture coordinates that are missing, outside the unit square, or
+    without area. ``name``: how to call the file."""
     missing = sum(m.uvs is None for m in asset.meshes)
     if missing:
-        raise InputError(f"{name}: {missing} of {len(asset.meshes)} meshes have no texture coordinates; {MENDING}")
+        raise InputError(
+            f"{name}: {missing} of {len(asset.meshes)} meshes have no texture coordinates; {MENDING}"
+        )
     outside = total = flat = 0
     area_flat = area_all = 0.0
     for mesh in asset.meshes:
         assert mesh.uvs is not None
         outside += int(((mesh.uvs < -OUTSIDE) | (mesh.uvs > 1 + OUTSIDE)).any(axis=1).sum())
         total += len(mesh.uvs)
-        p, t = mesh.positions[mesh.faces].astype(np.float64), mesh.uvs[mesh.faces].astype(np.float64)
+        p, t = (
+            mesh.positions[mesh.faces].astype(np.float64),
+            mesh.uvs[mesh.faces].astype(np.float64),
+        )
         area = np.linalg.norm(np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]), axis=1)
         a, b = t[:, 1] - t[:, 0], t[:, 2] - t[:, 0]
         none = np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) / 2 < NO_AREA
@@ -52,7 +58,9 @@ def check_uvs(asset: Asset, name: str) -> None:
         area_flat += float(area[none].sum())
         area_all += float(area.sum())
     if outside:
-        raise InputError(f"{name}: {outside} of {total} texture coordinates lie outside the unit square; {MENDING}")
+        raise InputError(
+            f"{name}: {outside} of {total} texture coordinates lie outside the unit square; {MENDING}"
+        )
     if area_flat > NO_SURFACE * area_all:
         share = 100 * area_flat / area_all
         raise InputError(
@@ -71,8 +79,8 @@ def check_overlap(mesh: LatentMesh, name: str) -> None:
 
 
 def overlap(mesh: LatentMesh, size: int = OVERLAP_SIZE) -> tuple[int, float]:
-    """(triangles that overlap others in the atlas, share of the covered grid points that more than one
-    triangle holds)."""
+    """(triangles that overlap others in the atlas, share of the covered grid points that more than
+    one triangle holds)."""
     count = len(mesh.faces)
     uv = mesh.uvs[mesh.frame_faces]
     # every triangle at a height of its own: a ray from above meets those that overlap one by one
@@ -104,14 +112,18 @@ PASSES = 4
 """Triangles whose very edge a point may touch before it is given up."""
 
 
-def _two_hits(scene: mi.Scene, inset: mi.Float, count: int, u: mi.Float, v: mi.Float) -> tuple[mi.UInt32, mi.UInt32]:
-    """The first two triangles, from above, that hold the points well inside; ``NONE`` for none. ``count``: of all
-    triangles."""
+def _two_hits(
+    scene: mi.Scene, inset: mi.Float, count: int, u: mi.Float, v: mi.Float
+) -> tuple[mi.UInt32, mi.UInt32]:
+    """The first two triangles, from above, that hold the points well inside; ``NONE`` for none.
+    ``count``: of all triangles."""
     top, layer = mi.Float(2), dr.opaque(mi.Float, 1 / count)
     first, second = mi.UInt32(NONE), mi.UInt32(NONE)
     for _ in range(PASSES):
         ray = mi.Ray3f(mi.Point3f(u, v, top), mi.Vector3f(0, 0, -1))
-        hit = scene.ray_intersect_preliminary(ray, coherent=True, active=(top > 0) & (second == NONE))
+        hit = scene.ray_intersect_preliminary(
+            ray, coherent=True, active=(top > 0) & (second == NONE)
+        )
         valid = hit.is_valid()
         prim = dr.select(valid, hit.prim_index, 0)
         b1, b2 = hit.prim_uv.x, hit.prim_uv.y
@@ -130,12 +142,15 @@ def _inset(uv: NDArray, size: int) -> NDArray[np.float32]:
     t = uv.astype(np.float64)
     a, b = t[:, 1] - t[:, 0], t[:, 2] - t[:, 0]
     double = np.maximum(np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]), 1e-30)
-    sides = np.stack([np.linalg.norm(t[:, (k + 2) % 3] - t[:, (k + 1) % 3], axis=1) for k in range(3)], axis=1)
+    sides = np.stack(
+        [np.linalg.norm(t[:, (k + 2) % 3] - t[:, (k + 1) % 3], axis=1) for k in range(3)], axis=1
+    )
     return np.minimum(OVERLAP_MARGIN / size * sides / double[:, None], 1.0).astype(np.float32)
 
 
 PLACE, SIZE = 0.05, 0.1
-"""Centres of the two boxes may differ by this share of HIGH's diagonal, and their diagonals by this share."""
+"""Centres of the two boxes may differ by this share of HIGH's diagonal, and their diagonals by this
+share."""
 
 
 def check_place(high: Asset, low: Asset) -> None:

@@ -1,7 +1,8 @@
-"""The closed-form bake: for every texel, a ray finds the point of the heavy mesh that it stands for.
+"""The closed-form bake: for every texel, a ray finds the point of the heavy mesh that it stands
+for.
 
-No image, no optimisation: seconds. Worked off in bands of rows, so that memory does not grow with the size of
-the maps, but for the maps themselves.
+No image, no optimisation: seconds. Worked off in bands of rows, so that memory does not grow with
+the size of the maps, but for the maps themselves.
 """
 
 from __future__ import annotations
@@ -47,10 +48,11 @@ FAR = 4.0
 
 @dataclass(frozen=True)
 class Settings:
-    """What to bake and how. ``fields``: names of ``FIELDS``. ``samples``: rays per texel. ``reach``: how far
-    rays go outward and inward, None for the automatic cage. ``fill_hidden``: texels that nothing outside can see, or
-    whose point of the reference nothing can see, are filled from their neighbours: where parts touch, two surfaces
-    coincide, and rays would find one or the other at random. Lengths in local units."""
+    """What to bake and how. ``fields``: names of ``FIELDS``. ``samples``: rays per texel.
+    ``reach``: how far rays go outward and inward, None for the automatic cage. ``fill_hidden``:
+    texels that nothing outside can see, or whose point of the reference nothing can see, are filled
+    from their neighbours: where parts touch, two surfaces coincide, and rays would find one or the
+    other at random. Lengths in local units."""
 
     size: int
     fields: tuple[str, ...] = ("material", "normal")
@@ -64,10 +66,11 @@ class Settings:
 
 @dataclass(frozen=True)
 class BakedMaps:
-    """``maps``: channel name -> (size, size) float32, natural units (linear colours, normals in [-1, 1],
-    lengths in local units), filled everywhere. ``covered``: texels that belong to a triangle of the
-    atlas. ``missed``: those among them whose rays found nothing. ``hidden``: those that nothing outside
-    can see, if that was asked for (they do not count as missed). ``reach``: how far rays went."""
+    """``maps``: channel name -> (size, size) float32, natural units (linear colours, normals in
+    [-1, 1], lengths in local units), filled everywhere. ``covered``: texels that belong to a
+    triangle of the atlas. ``missed``: those among them whose rays found nothing. ``hidden``: those
+    that nothing outside can see, if that was asked for (they do not count as missed). ``reach``:
+    how far rays went."""
 
     maps: dict[str, NDArray[np.float32]]
     covered: NDArray[np.bool_]
@@ -95,7 +98,9 @@ def bake(reference: MeshReference, mesh: LatentMesh, settings: Settings) -> Bake
             here = slice(row, row + len(sums))
             hits = sums[..., len(names)]
             values[here] = sums[..., : len(names)] / np.maximum(hits, 1)[..., None]
-            found[here], covered[here], hidden[here] = (sums[..., len(names) + k] > 0 for k in range(3))
+            found[here], covered[here], hidden[here] = (
+                sums[..., len(names) + k] > 0 for k in range(3)
+            )
     hidden &= ~found
     maps: dict[str, NDArray[np.float32]] = {}
     start = 0
@@ -113,7 +118,9 @@ def bake(reference: MeshReference, mesh: LatentMesh, settings: Settings) -> Bake
 class _Run:
     """What every band needs."""
 
-    def __init__(self, reference: MeshReference, points: TexelPoints, settings: Settings, reach: float) -> None:
+    def __init__(
+        self, reference: MeshReference, points: TexelPoints, settings: Settings, reach: float
+    ) -> None:
         self.reference, self.points, self.settings = reference, points, settings
         self.reach = dr.opaque(mi.Float, reach)
         self.width = 1 << (sum(len(FIELDS[f]) for f in settings.fields) + 2).bit_length()
@@ -123,8 +130,8 @@ class _Run:
             self.curvature = upload.packets(1, mean_curvature(merged.positions, merged.faces))
 
     def band(self, row: int) -> NDArray[np.float32]:
-        """(rows, size, width) sums over the samples of each texel: channels, hits, samples inside a chart, hits that
-        nothing outside can see (which count as no hits)."""
+        """(rows, size, width) sums over the samples of each texel: channels, hits, samples inside a
+        chart, hits that nothing outside can see (which count as no hits)."""
         rows, size = self.points.rows, self.points.size
         total = dr.zeros(mi.Float, rows * size * self.width)
         for k, (dx, dy) in enumerate(sub_pixel_offsets(self.settings.samples)):
@@ -141,14 +148,21 @@ class _Run:
             hidden = self._hidden(points, found)
             found.valid &= ~hidden
         rows = [dr.select(found.valid, x, 0) for x in self._values(points, found, seed)]
-        rows += [dr.select(found.valid, mi.Float(1), 0), mi.Float(1), dr.select(hidden, mi.Float(1), 0)]
+        rows += [
+            dr.select(found.valid, mi.Float(1), 0),
+            mi.Float(1),
+            dr.select(hidden, mi.Float(1), 0),
+        ]
         rows += [mi.Float(0)] * (self.width - len(rows))
         # one sample of each texel: no two threads meet
-        dr.scatter_reduce(dr.ReduceOp.Add, total, mi.ArrayXf(rows), points.texel, mode=dr.ReduceMode.NoConflicts)
+        dr.scatter_reduce(
+            dr.ReduceOp.Add, total, mi.ArrayXf(rows), points.texel, mode=dr.ReduceMode.NoConflicts
+        )
         dr.eval(total)
 
     def _hidden(self, points: Points, found: Found) -> mi.Bool:
-        """Points of the mesh that nothing outside can see, or whose point of the reference nothing can see."""
+        """Points of the mesh that nothing outside can see, or whose point of the reference nothing
+        can see."""
         flat = face_normal(self.points.surface, points.triangle, mi.Bool(True))
         flat *= dr.rsqrt(dr.fmax(dr.squared_norm(flat), 1e-30))
         all_ = dr.full(mi.Bool, True, dr.width(points.texel))
@@ -158,7 +172,9 @@ class _Run:
         prim = dr.select(found.valid, found.triangle, 0)
         position, geometric, _ = self.reference.geometry_at(prim, found.b1, found.b2)
         front_only = _of(self.reference.surface.culled, prim)
-        return ~out | (both & ~exposed(self.reference.scene, position, geometric, both, FAR, front_only))
+        return ~out | (
+            both & ~exposed(self.reference.scene, position, geometric, both, FAR, front_only)
+        )
 
     def _values(self, points: Points, found: Found, seed: int) -> list[mi.Float]:
         """All channels of the wanted fields, in order."""
@@ -181,7 +197,9 @@ class _Run:
             out["emission"] = self.reference.emission_at(prim, found.b1, found.b2, points.area)
         if self.curvature is not None:
             surface = self.reference.surface
-            out["curvature"] = interpolate_packets(surface, self.curvature, prim, found.b1, found.b2, 1)
+            out["curvature"] = interpolate_packets(
+                surface, self.curvature, prim, found.b1, found.b2, 1
+            )
         return [x for f in fields for x in out[f]]
 
 
@@ -191,8 +209,8 @@ def _of(culled: mi.Bool | None, triangle: mi.UInt32) -> mi.Bool | None:
 
 
 def to_tangent_space(here: Hit, normal: mi.Vector3f) -> list[mi.Float]:
-    """A world-space normal in the shader's tangent basis, whose tangent need not be perpendicular to the
-    interpolated normal. It never points below the surface."""
+    """A world-space normal in the shader's tangent basis, whose tangent need not be perpendicular
+    to the interpolated normal. It never points below the surface."""
     n, t = here.normal, here.tangent
     assert t is not None and here.handedness is not None
     bitangent = dr.cross(n, t) * here.handedness

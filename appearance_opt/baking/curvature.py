@@ -13,12 +13,13 @@ if TYPE_CHECKING:
 
 
 def mean_curvature(positions: NDArray, faces: NDArray) -> NDArray[np.float32]:
-    """(V,) mean curvature (k1 + k2) / 2 in 1 / unit of length, positive where the surface is convex.
+    """(V,) mean curvature (k1 + k2) / 2 in 1 / unit of length, positive where the surface is
+    convex.
 
-    Steiner's formula, as in Cohen-Steiner and Morvan 2003: an edge carries half its length times the angle
-    between its faces; a vertex has half of what its edges carry, over the area around it that is nearer to it
-    than to its neighbours (Meyer et al. 2003). Vertices at one place count as one. Open and non-manifold
-    edges carry nothing.
+    Steiner's formula, as in Cohen-Steiner and Morvan 2003: an edge carries half its length times
+    the angle between its faces; a vertex has half of what its edges carry, over the area around it
+    that is nearer to it than to its neighbours (Meyer et al. 2003). Vertices at one place count as
+    one. Open and non-manifold edges carry nothing.
     """
     first, place = weld(np.asarray(positions))
     p = np.asarray(positions, np.float64)[first]
@@ -46,10 +47,18 @@ def mean_curvature(positions: NDArray, faces: NDArray) -> NDArray[np.float32]:
 
 
 def _corner_areas(corners: NDArray) -> NDArray[np.float64]:
-    """(F, 3) share of each corner in the area of its triangle (F, 3, 3): its Voronoi region, or in obtuse
-    triangles half of the area for the obtuse corner and a quarter for the others."""
-    sides = np.stack([np.sum((corners[:, (k + 2) % 3] - corners[:, (k + 1) % 3]) ** 2, axis=1) for k in range(3)], 1)
-    double = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    """(F, 3) share of each corner in the area of its triangle (F, 3, 3): its Voronoi region, or in
+    obtuse triangles half of the area for the obtuse corner and a quarter for the others."""
+    sides = np.stack(
+        [
+            np.sum((corners[:, (k + 2) % 3] - corners[:, (k + 1) % 3]) ** 2, axis=1)
+            for k in range(3)
+        ],
+        1,
+    )
+    double = np.linalg.norm(
+        np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
+    )
     # cotangent of the angle at each corner: dot product of its two edges over the doubled area
     dot = (sides.sum(axis=1, keepdims=True) - 2 * sides) / 2
     weighted = sides * dot / np.maximum(double, 1e-300)[:, None]

@@ -37,7 +37,9 @@ def quantise(values: NDArray, bits: int) -> NDArray:
     return (np.clip(values, 0, 1) * top + 0.5).astype(kind)
 
 
-def normal_image(maps: Mapping[str, NDArray], prefix: str = "normal", flip_green: bool = False) -> NDArray[np.float32]:
+def normal_image(
+    maps: Mapping[str, NDArray], prefix: str = "normal", flip_green: bool = False
+) -> NDArray[np.float32]:
     """(H, W, 3) unit normals as (n + 1) / 2."""
     n = stack_maps(maps, *(f"{prefix}_{axis}" for axis in "xyz"))
     n /= np.maximum(np.linalg.norm(n, axis=-1, keepdims=True), 1e-6)
@@ -61,8 +63,8 @@ def curvature_scale(maps: Mapping[str, NDArray], covered: NDArray) -> float:
 def material_change(
     maps: Mapping[str, NDArray], options: BakeOptions, unlit: bool = False
 ) -> Callable[[Material], Material]:
-    """A function from LOW's materials to those of the result: what was baked replaces what was there. ``unlit``: is
-    HIGH?"""
+    """A function from LOW's materials to those of the result: what was baked replaces what was
+    there. ``unlit``: is HIGH?"""
     new: dict[str, Any] = {}
     if options.wants("base-color"):
         color = linear_to_srgb(np.clip(stack_maps(maps, "red", "green", "blue"), 0, 1))
@@ -70,7 +72,12 @@ def material_change(
         new |= {"base_color": (1.0, 1.0, 1.0), "base_color_texture": texture, "unlit": unlit}
     if options.wants("orm"):
         orm = Texture(quantise(orm_image(maps), 8), "linear", CLAMP)
-        new |= {"roughness": 1.0, "metalness": 1.0, "orm_texture": orm, "has_occlusion": "occlusion" in maps}
+        new |= {
+            "roughness": 1.0,
+            "metalness": 1.0,
+            "orm_texture": orm,
+            "has_occlusion": "occlusion" in maps,
+        }
     if options.wants("normal"):
         new |= {
             "normal_scale": 1.0,
@@ -90,8 +97,8 @@ def material_change(
 
 @dataclass(frozen=True)
 class LooseMap:
-    """A map as a file of its own: ``pixels`` (H, W, C) in [0, 1] (``srgb``: linear ones that a PNG shall encode),
-    and ``facts`` for the list of maps."""
+    """A map as a file of its own: ``pixels`` (H, W, C) in [0, 1] (``srgb``: linear ones that a PNG
+    shall encode), and ``facts`` for the list of maps."""
 
     name: str
     pixels: NDArray[np.float32]
@@ -131,40 +138,62 @@ def loose_files(
             listed[key] = {"file": name, "scale": scale, "mid_level": mid, **common}
     coverage = f"{stem}_coverage.png"
     files[coverage] = images.encode_png(coverage_picture(covered, missed))
-    listed["coverage"] = {"file": coverage, "encoding": "white: found; red: missed, filled; black: outside of charts"}
-    files[f"{stem}_maps.json"] = json.dumps({"texels": list(covered.shape), "maps": listed}, indent=1).encode()
+    listed["coverage"] = {
+        "file": coverage,
+        "encoding": "white: found; red: missed, filled; black: outside of charts",
+    }
+    files[f"{stem}_maps.json"] = json.dumps(
+        {"texels": list(covered.shape), "maps": listed}, indent=1
+    ).encode()
     return files
 
 
 HEIGHT = "scale * (texel - mid_level)"
 
 
-def _loose_maps(maps: Mapping[str, NDArray], covered: NDArray, options: BakeOptions) -> Iterator[LooseMap]:
+def _loose_maps(
+    maps: Mapping[str, NDArray], covered: NDArray, options: BakeOptions
+) -> Iterator[LooseMap]:
     """The maps asked for, but the displacement."""
     if options.wants("base-color"):
         yield LooseMap("base-color", stack_maps(maps, "red", "green", "blue"), srgb=True)
     if options.wants("orm"):
-        yield LooseMap("orm", orm_image(maps), facts={"channels": "occlusion, roughness, metalness"})
+        yield LooseMap(
+            "orm", orm_image(maps), facts={"channels": "occlusion, roughness, metalness"}
+        )
     unit = {"encoding": "(n + 1) / 2"}
     if options.wants("normal"):
         pixels = normal_image(maps, flip_green=options.green == "directx")
-        yield LooseMap("normal", pixels, facts={"space": "tangent (MikkTSpace)", "green": options.green, **unit})
+        yield LooseMap(
+            "normal",
+            pixels,
+            facts={"space": "tangent (MikkTSpace)", "green": options.green, **unit},
+        )
     if options.wants("object-normal"):
-        yield LooseMap("object-normal", normal_image(maps, "object"), facts={"space": "object, +Y up", **unit})
+        yield LooseMap(
+            "object-normal", normal_image(maps, "object"), facts={"space": "object, +Y up", **unit}
+        )
     if EMISSION[0] in maps:
         pixels = stack_maps(maps, *EMISSION)
         yield LooseMap("emission", pixels, srgb=True)
     if options.wants("ao"):
-        yield LooseMap("ao", stack_maps(maps, "occlusion"), facts={"encoding": "1: open, 0: occluded"})
+        yield LooseMap(
+            "ao", stack_maps(maps, "occlusion"), facts={"encoding": "1: open, 0: occluded"}
+        )
     if options.wants("curvature"):
         exr = options.texture_format == "exr"
         scale, mid = (1.0, 0.0) if exr else (2 * curvature_scale(maps, covered), 0.5)
         facts = {"unit": "1 / metre", "value": HEIGHT, "scale": scale, "mid_level": mid}
-        yield LooseMap("curvature", stack_maps(maps, "curvature") / np.float32(scale) + np.float32(mid), facts=facts)
+        yield LooseMap(
+            "curvature",
+            stack_maps(maps, "curvature") / np.float32(scale) + np.float32(mid),
+            facts=facts,
+        )
 
 
 def coverage_picture(covered: NDArray, missed: NDArray) -> NDArray[np.uint8]:
-    """(H, W, 3): white where a ray found the heavy mesh, red where it missed, black outside of the charts."""
+    """(H, W, 3): white where a ray found the heavy mesh, red where it missed, black outside of the
+    charts."""
     out = np.zeros((*covered.shape, 3), np.uint8)
     out[covered] = 255
     out[missed] = (255, 0, 0)

@@ -20,22 +20,25 @@ LIFT = 1e-4
 """How far rays start above the surface, in units of the object's radius (1 in local units)."""
 
 TRIES = (1, 7, 24, 96)
-"""Directions in which a way out is looked for, in several goes: most points see the sky along their normal, and only
-those that have found no way out yet take part in the next go. A point visible from less than a hundredth of all
-directions may be taken for hidden."""
+"""Directions in which a way out is looked for, in several goes: most points see the sky along their
+normal, and only those that have found no way out yet take part in the next go. A point visible from
+less than a hundredth of all directions may be taken for hidden."""
 
 
 def openness(
     reference: MeshReference, found: Found, seed: mi.UInt32, rays: int, distance: float, far: float
 ) -> mi.Float:
-    """Cosine-weighted share of the hemisphere in which nothing is met within ``distance``, in [0, 1].
+    """Cosine-weighted share of the hemisphere in which nothing is met within ``distance``, in [0,
+    1].
 
-    ``rays`` directions per point, a low-discrepancy sequence shifted by a hash of ``seed`` (Cranley and
-    Patterson 1976). ``far``: a distance beyond which there is nothing.
+    ``rays`` directions per point, a low-discrepancy sequence shifted by a hash of ``seed`` (Cranley
+    and Patterson 1976). ``far``: a distance beyond which there is nothing.
     """
     prim = dr.select(found.valid, found.triangle, 0)
     position, geometric, normal = reference.geometry_at(prim, found.b1, found.b2)
-    tangent = dr.normalize(dr.cross(normal, dr.select(dr.abs(normal.x) < 0.9, mi.Vector3f(1, 0, 0), [0, 1, 0])))
+    tangent = dr.normalize(
+        dr.cross(normal, dr.select(dr.abs(normal.x) < 0.9, mi.Vector3f(1, 0, 0), [0, 1, 0]))
+    )
     bitangent = dr.cross(normal, tangent)
     origin = dr.fma(geometric, LIFT, position)
     length = dr.opaque(mi.Float, min(distance, far))
@@ -58,11 +61,17 @@ def openness(
 
 
 def exposed(
-    scene: Scene, position: mi.Point3f, normal: mi.Vector3f, active: mi.Bool, far: float, culled: mi.Bool | None = None
+    scene: Scene,
+    position: mi.Point3f,
+    normal: mi.Vector3f,
+    active: mi.Bool,
+    far: float,
+    culled: mi.Bool | None = None,
 ) -> mi.Bool:
-    """Which of the ``active`` points of a surface something outside can see, from either side: those from which some
-    ray gets away. Where parts touch, both surfaces are hidden. ``far``: a distance beyond which there is nothing.
-    ``culled``: points that are seen from the side of their ``normal`` only."""
+    """Which of the ``active`` points of a surface something outside can see, from either side:
+    those from which some ray gets away. Where parts touch, both surfaces are hidden. ``far``: a
+    distance beyond which there is nothing. ``culled``: points that are seen from the side of their
+    ``normal`` only."""
     out = dr.zeros(mi.Bool, dr.width(position))
     left = dr.compress(active)
     length = dr.opaque(mi.Float, far)
@@ -81,7 +90,9 @@ def exposed(
                 d = dr.select(below & front_only, -d, d)
                 below &= ~front_only
             side = dr.select(below, mi.Float(-LIFT), mi.Float(LIFT))
-            hidden &= blocked(scene, mi.Ray3f(dr.fma(n, side, p), d, length, 0, mi.Color0f()), hidden)
+            hidden &= blocked(
+                scene, mi.Ray3f(dr.fma(n, side, p), d, length, 0, mi.Color0f()), hidden
+            )
             dr.eval(hidden)
         dr.scatter(out, ~hidden, left)
         left = dr.gather(mi.UInt32, left, dr.compress(hidden))
@@ -90,8 +101,8 @@ def exposed(
 
 
 def _on_sphere(u: float, v: float) -> tuple[float, float, float]:
-    """Unit vector of a point of the unit square, area to area (that of ``mi.warp`` needs LLVM 17: see
-    ``render/math.py``)."""
+    """Unit vector of a point of the unit square, area to area (that of ``mi.warp`` needs LLVM 17:
+    see ``render/math.py``)."""
     z = 1 - 2 * v
     radius, azimuth = math.sqrt(max(1 - z * z, 0.0)), 2 * math.pi * u
     return radius * math.cos(azimuth), radius * math.sin(azimuth), z

@@ -38,8 +38,8 @@ Pick = Literal["nearest", "outermost"]
 
 @dataclass
 class Found:
-    """Per point: triangle and barycentrics of the reference, signed distance along the ray (positive
-    outward), and whether there is one at all."""
+    """Per point: triangle and barycentrics of the reference, signed distance along the ray
+    (positive outward), and whether there is one at all."""
 
     triangle: mi.UInt32
     b1: mi.Float
@@ -48,19 +48,23 @@ class Found:
     valid: mi.Bool
 
 
-def find(reference: MeshReference, points: Points, reach: mi.Float, pick: Pick = "nearest") -> Found:
-    """The reference's point of each texel within ``reach``, whose triangle faces the way of the ray.
+def find(
+    reference: MeshReference, points: Points, reach: mi.Float, pick: Pick = "nearest"
+) -> Found:
+    """The reference's point of each texel within ``reach``, whose triangle faces the way of the
+    ray.
 
-    "nearest": the nearest one along the ray in either direction. "outermost": the first one met from the
-    cage inward, as most bakers do it; it picks up neighbouring layers wherever parts lie close together (it costs
-    2 to 4 dB on such assets), but sees parts that float above the surface.
+    "nearest": the nearest one along the ray in either direction. "outermost": the first one met
+    from the cage inward, as most bakers do it; it picks up neighbouring layers wherever parts lie
+    close together (it costs 2 to 4 dB on such assets), but sees parts that float above the surface.
     """
     along, position = points.along, points.here.position
     if pick == "outermost":
         start = dr.fma(along, reach, position)
         triangle, b1, b2, t = _facing_hit(reference, start, -along, along, 2 * reach)
         return Found(triangle, b1, b2, reach - t, t < 2 * reach)
-    # a ray from a surface does not meet that surface: start a little before it, for where the two meshes coincide
+    # a ray from a surface does not meet that surface: start a little before it, for where the two
+    # meshes coincide
     back = BACK * reach
     ahead = _facing_hit(reference, dr.fma(-along, back, position), along, along, reach + back)
     behind = _facing_hit(reference, dr.fma(along, back, position), -along, along, reach + back)
@@ -71,11 +75,18 @@ def find(reference: MeshReference, points: Points, reach: mi.Float, pick: Pick =
 
 
 def _facing_hit(
-    reference: MeshReference, origin: mi.Point3f, direction: mi.Vector3f, facing: mi.Vector3f, length: mi.Float
+    reference: MeshReference,
+    origin: mi.Point3f,
+    direction: mi.Vector3f,
+    facing: mi.Vector3f,
+    length: mi.Float,
 ) -> tuple[mi.UInt32, mi.Float, mi.Float, mi.Float]:
     """(triangle, barycentrics, distance) of the first hit of rays whose triangle faces the way of
     ``facing``, passing through at most ``LAYERS`` others; infinite distance if there is none."""
-    found = [_first_facing(reference, p, origin, direction, facing, length) for p in parts_of(reference.scene)]
+    found = [
+        _first_facing(reference, p, origin, direction, facing, length)
+        for p in parts_of(reference.scene)
+    ]
     if len(found) == 1:
         return found[0]
     first = found[0][3] <= found[1][3]
@@ -112,14 +123,15 @@ def _first_facing(
 
 
 def automatic_reach(reference: MeshReference, mesh: LatentMesh) -> float:
-    """The automatic cage: ``REACH`` times the distance within which nearly all of the reference lies."""
+    """The automatic cage: ``REACH`` times the distance within which nearly all of the reference
+    lies."""
     diagonal = float(np.linalg.norm(np.ptp(reference.merged.positions, axis=0)))
     return max(REACH * deviation(reference, mesh), LEAST * diagonal)
 
 
 def deviation(reference: MeshReference, mesh: LatentMesh) -> float:
-    """Distance within which nearly all of the reference (its quantile ``QUANTILE``) lies from the simple
-    mesh, measured along the reference's normals."""
+    """Distance within which nearly all of the reference (its quantile ``QUANTILE``) lies from the
+    simple mesh, measured along the reference's normals."""
     merged = reference.merged
     every = max(1, len(merged.positions) // 50_000)
     p, normals = merged.positions[::every], merged.normals[::every]
@@ -131,6 +143,7 @@ def deviation(reference: MeshReference, mesh: LatentMesh) -> float:
     diagonal = float(np.linalg.norm(np.ptp(merged.positions, axis=0)))
     if not len(nearest):
         return 0.02 * diagonal
-    # rays that find nothing near hit the far side of the object: they say nothing about the distance
+    # rays that find nothing near hit the far side of the object: they say nothing about the
+    # distance
     near = nearest[nearest < 0.05 * diagonal]
     return float(np.quantile(near, QUANTILE)) if len(near) else 0.02 * diagonal

@@ -1,4 +1,5 @@
-"""The light mesh of a bake: taken as it is, with its own normals, topology and texture coordinates."""
+"""The light mesh of a bake: taken as it is, with its own normals, topology and texture
+coordinates."""
 
 from __future__ import annotations
 
@@ -20,8 +21,8 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Low:
-    """``asset``: the meshes as they are written, normals and, where no vertex must be split for them,
-    tangents completed. ``mesh``: all of them as one latent with fixed tangents."""
+    """``asset``: the meshes as they are written, normals and, where no vertex must be split for
+    them, tangents completed. ``mesh``: all of them as one latent with fixed tangents."""
 
     asset: Asset
     mesh: LatentMesh
@@ -30,12 +31,14 @@ class Low:
 def prepare(asset: Asset) -> Low:
     """Complete and merge the meshes, all of which need texture coordinates.
 
-    A mesh keeps the normals and tangents of its file; what is missing is computed: angle-weighted normals,
-    MikkTSpace's tangents. Positions, faces and texture coordinates are never touched.
+    A mesh keeps the normals and tangents of its file; what is missing is computed: angle-weighted
+    normals, MikkTSpace's tangents. Positions, faces and texture coordinates are never touched.
     """
     meshes, parts = [], []
     for mesh in asset.meshes:
-        normals = vertex_normals(mesh.positions, mesh.faces) if mesh.normals is None else mesh.normals
+        normals = (
+            vertex_normals(mesh.positions, mesh.faces) if mesh.normals is None else mesh.normals
+        )
         mesh = replace(mesh, normals=normals)
         index, faces = np.arange(len(mesh.positions)), mesh.faces
         uvs, tangents = mesh.uvs, mesh.tangents
@@ -47,24 +50,36 @@ def prepare(asset: Asset) -> Low:
         meshes.append(mesh)
         parts.append((mesh.positions[index], faces, uvs[index], normals[index], tangents))
     start = np.cumsum([0] + [len(p[0]) for p in parts[:-1]])
-    positions, uvs, normals, tangents = (np.concatenate([p[k] for p in parts]) for k in (0, 2, 3, 4))
+    positions, uvs, normals, tangents = (
+        np.concatenate([p[k] for p in parts]) for k in (0, 2, 3, 4)
+    )
     faces = np.concatenate([p[1] + s for p, s in zip(parts, start, strict=True)]).astype(np.int32)
-    latent = LatentMesh(positions, faces, np.arange(len(positions), dtype=np.int32), faces, uvs, normals, tangents)
+    latent = LatentMesh(
+        positions, faces, np.arange(len(positions), dtype=np.int32), faces, uvs, normals, tangents
+    )
     latent = replace(latent, single=single_sided(asset.meshes))
     return Low(replace(asset, meshes=tuple(meshes)), latent)
 
 
 def movable(mesh: LatentMesh) -> LatentMesh:
-    """The mesh with its vertices joined wherever they lie at the same place, so that its shape can be fitted and
-    no seam opens; those of sheets back to back are not, unless the mesh itself joins them. Faces and texture
-    coordinates stay; normals follow from the shape from now on."""
+    """The mesh with its vertices joined wherever they lie at the same place, so that its shape can
+    be fitted and no seam opens; those of sheets back to back are not, unless the mesh itself joins
+    them. Faces and texture coordinates stay; normals follow from the shape from now on."""
     first, place = weld(mesh.positions)
     welded = place[mesh.faces].astype(np.int32)
     sheets = separate(mesh.positions[first], welded, mesh.single)
-    positions, faces, vertex = sheets.positions, sheets.faces, place[mesh.frame_vertex].astype(np.int32)
+    positions, faces, vertex = (
+        sheets.positions,
+        sheets.faces,
+        place[mesh.frame_vertex].astype(np.int32),
+    )
     vertex[mesh.frame_faces] = faces
     if not np.array_equal(vertex[mesh.frame_faces], faces):
-        positions, faces, vertex = mesh.positions[first], welded, place[mesh.frame_vertex].astype(np.int32)
+        positions, faces, vertex = (
+            mesh.positions[first],
+            welded,
+            place[mesh.frame_vertex].astype(np.int32),
+        )
     return LatentMesh(
         positions=positions,
         faces=faces,
@@ -76,8 +91,8 @@ def movable(mesh: LatentMesh) -> LatentMesh:
 
 
 def unwrap_asset(asset: Asset, size: int) -> Asset:
-    """The asset with new texture coordinates: charts of all meshes packed into one square for ``size``
-    texels. Vertices are split at chart borders; faces and normals stay."""
+    """The asset with new texture coordinates: charts of all meshes packed into one square for
+    ``size`` texels. Vertices are split at chart borders; faces and normals stay."""
     from appearance_opt.initial.atlas import unwrap
 
     start = np.cumsum([0] + [len(m.positions) for m in asset.meshes])
@@ -103,4 +118,6 @@ def with_material(asset: Asset, change: Callable[[Material], Material]) -> Asset
     for mesh in asset.meshes:
         if id(mesh.material) not in new:
             new[id(mesh.material)] = change(mesh.material)
-    return replace(asset, meshes=tuple(replace(m, material=new[id(m.material)]) for m in asset.meshes))
+    return replace(
+        asset, meshes=tuple(replace(m, material=new[id(m.material)]) for m in asset.meshes)
+    )

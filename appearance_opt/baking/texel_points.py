@@ -28,8 +28,9 @@ BAND = 1 << 20
 class Points:
     """Points of a mesh that lie under texels of one band, one per texel.
 
-    ``texel``: index into the band; ``here``: attributes of the mesh; ``along``: unit direction of the
-    texel's ray; ``area``: world-space area that the point stands for; ``triangle``: of the mesh.
+    ``texel``: index into the band; ``here``: attributes of the mesh; ``along``: unit direction of
+    the texel's ray; ``area``: world-space area that the point stands for; ``triangle``: of the
+    mesh.
     """
 
     texel: mi.UInt32
@@ -42,8 +43,8 @@ class Points:
 class TexelPoints:
     """The atlas of a mesh as a flat scene, and the mesh under it.
 
-    Rays follow the mesh's smooth normals, averaged over all faces at a place, so that no gap opens at a hard
-    edge; what they find is expressed in the mesh's own tangent bases.
+    Rays follow the mesh's smooth normals, averaged over all faces at a place, so that no gap opens
+    at a hard edge; what they find is expressed in the mesh's own tangent bases.
     """
 
     def __init__(self, mesh: LatentMesh, size: int, samples: int = 1) -> None:
@@ -63,8 +64,8 @@ class TexelPoints:
         return self._topology.scene()
 
     def band(self, row: int, dx: float, dy: float) -> Points | None:
-        """Points under (dx, dy), in texels, of the texels of ``rows`` rows from ``row`` on; None if there
-        are none."""
+        """Points under (dx, dy), in texels, of the texels of ``rows`` rows from ``row`` on; None if
+        there are none."""
         i = dr.arange(mi.UInt32, self.rows * self.size)
         scale = dr.opaque(mi.Float, 1 / self.size)
         hit = _atlas_hit(self.atlas, i, self.size, row, dx, dy)
@@ -85,23 +86,34 @@ class TexelPoints:
     def _direction(self, here: Hit, triangle: mi.UInt32, b1: mi.Float, b2: mi.Float) -> mi.Vector3f:
         if self._directions is None:
             return here.normal
-        return dr.normalize(mi.Vector3f(*interpolate_packets(self.surface, self._directions, triangle, b1, b2, 4)[:3]))
+        return dr.normalize(
+            mi.Vector3f(
+                *interpolate_packets(self.surface, self._directions, triangle, b1, b2, 4)[:3]
+            )
+        )
 
 
 def interpolate_packets(
-    surface: Surface, values: mi.Float, triangle: mi.UInt32, b1: mi.Float, b2: mi.Float, channels: int
+    surface: Surface,
+    values: mi.Float,
+    triangle: mi.UInt32,
+    b1: mi.Float,
+    b2: mi.Float,
+    channels: int,
 ) -> list[mi.Float]:
     """Values per vertex (packets of ``channels``) at barycentric points of triangles."""
     n = dr.width(triangle)
     face = dr.gather(mi.ArrayXu, surface.faces, triangle, shape=(4, n))
     rows = [dr.gather(mi.ArrayXf, values, face[k], shape=(channels, n)) for k in range(3)]
     b0 = 1 - b1 - b2
-    return [dr.fma(rows[0][c], b0, dr.fma(rows[1][c], b1, rows[2][c] * b2)) for c in range(channels)]
+    return [
+        dr.fma(rows[0][c], b0, dr.fma(rows[1][c], b1, rows[2][c] * b2)) for c in range(channels)
+    ]
 
 
 def atlas_scene(mesh: LatentMesh) -> mi.Scene:
-    """The atlas as a flat mesh in the plane z = 0: a ray down at (u, v) tells which triangle a texel
-    belongs to."""
+    """The atlas as a flat mesh in the plane z = 0: a ray down at (u, v) tells which triangle a
+    texel belongs to."""
     flat = np.concatenate([mesh.uvs, np.zeros((len(mesh.uvs), 1), np.float32)], axis=1)
     return upload.scene_of(flat, mesh.frame_faces)
 
@@ -120,4 +132,6 @@ def _atlas_hit(
     scale = dr.opaque(mi.Float, 1 / size)
     u = (mi.Float(texel % size) + dr.opaque(mi.Float, dx)) * scale
     v = (mi.Float(texel // size) + dr.opaque(mi.Float, row + dy)) * scale
-    return atlas.ray_intersect_preliminary(mi.Ray3f(mi.Point3f(u, v, 1), mi.Vector3f(0, 0, -1)), coherent=True)
+    return atlas.ray_intersect_preliminary(
+        mi.Ray3f(mi.Point3f(u, v, 1), mi.Vector3f(0, 0, -1)), coherent=True
+    )

@@ -1,4 +1,5 @@
-"""Two assets side by side: their images from the same views under the same lights, and the difference."""
+"""Two assets side by side: their images from the same views under the same lights, and the
+difference."""
 
 from __future__ import annotations
 
@@ -21,8 +22,8 @@ if TYPE_CHECKING:
 
 @dataclass
 class Comparison:
-    """``metrics`` over the views; images (B, H, W, 4) premultiplied linear radiance and coverage; ``notes``: what the
-    loader dropped, repaired or assumed."""
+    """``metrics`` over the views; images (B, H, W, 4) premultiplied linear radiance and coverage;
+    ``notes``: what the loader dropped, repaired or assumed."""
 
     metrics: Metrics
     reference: NDArray[np.float32]
@@ -31,13 +32,21 @@ class Comparison:
 
 
 def compare_local(
-    reference: Asset, candidate: Asset, sampler: ViewSampler, views: int, resolution: int, samples: int
+    reference: Asset,
+    candidate: Asset,
+    sampler: ViewSampler,
+    views: int,
+    resolution: int,
+    samples: int,
 ) -> Comparison:
-    """Measure how different two assets look, which lie around the origin as the sampler asks. Raises InputError if
-    one of the two shows nothing."""
+    """Measure how different two assets look, which lie around the origin as the sampler asks.
+    Raises InputError if one of the two shows nothing."""
     drawn = sampler.draw(0, views)
     first, second = (render_asset(a, drawn, resolution, samples) for a in (reference, candidate))
-    for name, image, side in ((reference.name, first, "reference"), (candidate.name, second, "candidate")):
+    for name, image, side in (
+        (reference.name, first, "reference"),
+        (candidate.name, second, "candidate"),
+    ):
         if not image[..., 3].any():
             raise InputError(
                 f"{name}: nothing of it is seen in any of the {views} views, so that there is nothing to compare; "
@@ -48,4 +57,6 @@ def compare_local(
 
 def render_asset(asset: Asset, views: Views, resolution: int, samples: int) -> NDArray[np.float32]:
     """Images (B, H, W, 4) of an asset; the device memory of its textures is released afterwards."""
-    return check_images(MeshReference(asset).render(views, resolution, samples), len(views), resolution, asset.name)
+    return check_images(
+        MeshReference(asset).render(views, resolution, samples), len(views), resolution, asset.name
+    )

@@ -15,9 +15,10 @@ BEST_PSNR = 99.0
 
 @dataclass(frozen=True)
 class ViewMetrics:
-    """One view. PSNR in dB of sRGB display values in [0, 1], over the whole image and over the pixels that
-    either image covers; mean FLIP (Andersson et al. 2020, LDR); intersection over union of the silhouettes;
-    mean distance in pixels by which they differ (difference in coverage over the reference's outline)."""
+    """One view. PSNR in dB of sRGB display values in [0, 1], over the whole image and over the
+    pixels that either image covers; mean FLIP (Andersson et al. 2020, LDR); intersection over union
+    of the silhouettes; mean distance in pixels by which they differ (difference in coverage over
+    the reference's outline)."""
 
     psnr: float
     psnr_covered: float
@@ -39,15 +40,21 @@ class Metrics:
 
 
 def compare_images(reference: NDArray, candidate: NDArray) -> Metrics:
-    """Metrics of (B, H, W, 4) images, premultiplied linear radiance and coverage. Views in which both are empty (the
-    back of a single-sided plane) say nothing, and do not count. Raises ValueError for shapes that differ, InputError
-    if no view shows anything."""
+    """Metrics of (B, H, W, 4) images, premultiplied linear radiance and coverage. Views in which
+    both are empty (the back of a single-sided plane) say nothing, and do not count. Raises
+    ValueError for shapes that differ, InputError if no view shows anything."""
     if reference.shape != candidate.shape:
         raise ValueError(f"images differ in shape: {reference.shape} and {candidate.shape}")
     views = tuple(_view(r, c) for r, c in zip(reference, candidate, strict=True))
-    seen = [v for v, r, c in zip(views, reference, candidate, strict=True) if r[..., 3].any() or c[..., 3].any()]
+    seen = [
+        v
+        for v, r, c in zip(views, reference, candidate, strict=True)
+        if r[..., 3].any() or c[..., 3].any()
+    ]
     if not seen:
-        raise InputError(f"nothing is seen in any of {len(views)} views: there is nothing to compare")
+        raise InputError(
+            f"nothing is seen in any of {len(views)} views: there is nothing to compare"
+        )
     names = ("psnr", "psnr_covered", "flip", "silhouette_iou", "silhouette_shift")
     means = {n: float(np.mean([getattr(v, n) for v in seen])) for n in names}
     return Metrics(**means, views=views)
@@ -67,7 +74,9 @@ def _view(reference: NDArray, candidate: NDArray) -> ViewMetrics:
         psnr_covered=_psnr(float(error[covered].mean()) if covered.any() else 0.0),
         flip=float(flip),
         silhouette_iou=float((inside & other).sum() / max((inside | other).sum(), 1)),
-        silhouette_shift=float(np.abs(reference[..., 3] - candidate[..., 3]).sum() / max(outline, 1)),
+        silhouette_shift=float(
+            np.abs(reference[..., 3] - candidate[..., 3]).sum() / max(outline, 1)
+        ),
     )
 
 

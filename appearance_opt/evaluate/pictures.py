@@ -22,8 +22,8 @@ def difference(a: NDArray, b: NDArray) -> NDArray[np.uint8]:
 
 
 def wireframe(image: NDArray, triangle: NDArray) -> NDArray[np.uint8]:
-    """``image`` with lines between pixels that show different triangles. ``triangle``: (H, W) index, -1
-    where nothing is seen; may be twice as fine as the image, or any multiple."""
+    """``image`` with lines between pixels that show different triangles. ``triangle``: (H, W)
+    index, -1 where nothing is seen; may be twice as fine as the image, or any multiple."""
     edge = np.zeros(triangle.shape, bool)
     edge[1:] |= triangle[1:] != triangle[:-1]
     edge[:, 1:] |= triangle[:, 1:] != triangle[:, :-1]
@@ -37,12 +37,20 @@ def wireframe(image: NDArray, triangle: NDArray) -> NDArray[np.uint8]:
 def texture_pictures(asset: Asset) -> dict[str, NDArray[np.uint8]]:
     """The maps of an asset's first material as they are stored, by name."""
     m = asset.meshes[0].material
-    named = {"base colour": m.base_color_texture, "roughness, metalness": m.orm_texture, "normal": m.normal_texture}
+    named = {
+        "base colour": m.base_color_texture,
+        "roughness, metalness": m.orm_texture,
+        "normal": m.normal_texture,
+    }
     out = {}
     for name, texture in named.items():
         if texture is not None:
             pixels = texture.pixels[..., :3]
-            out[name] = pixels if pixels.dtype == np.uint8 else _bytes(_encode(texture.linear()[..., :3], name))
+            out[name] = (
+                pixels
+                if pixels.dtype == np.uint8
+                else _bytes(_encode(texture.linear()[..., :3], name))
+            )
     return out
 
 

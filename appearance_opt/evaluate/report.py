@@ -24,9 +24,9 @@ if TYPE_CHECKING:
 
 @dataclass
 class ReportData:
-    """Everything a report shows. ``metrics``: by column ("start", "result"); ``views``: per held-out
-    view the pictures by name, among them "reference" and "result"; ``maps``: pictures of the maps;
-    ``curve``: rows (seconds, step, PSNR, loss); ``facts``: what was asked and done."""
+    """Everything a report shows. ``metrics``: by column ("start", "result"); ``views``: per
+    held-out view the pictures by name, among them "reference" and "result"; ``maps``: pictures of
+    the maps; ``curve``: rows (seconds, step, PSNR, loss); ``facts``: what was asked and done."""
 
     title: str
     facts: dict[str, Any]
@@ -49,7 +49,9 @@ def write_report(folder: Path, data: ReportData) -> None:
     with publishing(folder / "report.html") as place:
         for name, content in encoded.items():
             place.with_name(name).write_bytes(content)
-        place.with_name("report.json").write_text(json.dumps(as_json(data), indent=1, allow_nan=False))
+        place.with_name("report.json").write_text(
+            json.dumps(as_json(data), indent=1, allow_nan=False)
+        )
         place.write_text(page(data, encoded), encoding="utf-8")
 
 
@@ -64,7 +66,10 @@ def as_json(data: ReportData) -> dict[str, Any]:
         "metrics": {name: asdict(m) for name, m in data.metrics.items()},
         # JSON has no NaN: there is no loss before the first step
         "curve": [
-            {name: value if math.isfinite(value) else None for name, value in zip(_CURVE, row, strict=True)}
+            {
+                name: value if math.isfinite(value) else None
+                for name, value in zip(_CURVE, row, strict=True)
+            }
             for row in data.curve
         ],
         "notes": data.notes,
@@ -91,7 +96,9 @@ def page(data: ReportData, encoded: dict[str, bytes]) -> str:
         "metrics": _metrics_table(data.metrics),
         "views": views,
         "maps": f"<h2>Maps</h2><div class='row'>{maps}</div>" if maps else "",
-        "curve": f"<h2>Held-out PSNR against time</h2>{curve_svg(data.curve)}" if len(data.curve) > 1 else "",
+        "curve": f"<h2>Held-out PSNR against time</h2>{curve_svg(data.curve)}"
+        if len(data.curve) > 1
+        else "",
         "facts": _facts_table(data.facts),
         "notes": f"<h2>Notes</h2><ul>{notes}</ul>" if notes else "",
     }
@@ -104,7 +111,9 @@ def _html(text: object) -> str:
     return html.escape(one_line(str(text)))
 
 
-def curve_svg(curve: list[tuple[float, int, float, float]], width: int = 720, height: int = 240) -> str:
+def curve_svg(
+    curve: list[tuple[float, int, float, float]], width: int = 720, height: int = 240
+) -> str:
     """Line chart of PSNR (dB) against seconds."""
     xs, ys = [p[0] for p in curve], [p[2] for p in curve]
     low, high = min(ys), max(ys)
@@ -116,18 +125,23 @@ def curve_svg(curve: list[tuple[float, int, float, float]], width: int = 720, he
         px = left + (width - left - right) * x / max(xs[-1], 1e-9)
         return px, height - bottom - (height - bottom - top) * (y - low) / (high - low)
 
-    points = " ".join(f"{a:.1f},{b:.1f}" for a, b in (at(x, y) for x, y in zip(xs, ys, strict=True)))
+    points = " ".join(
+        f"{a:.1f},{b:.1f}" for a, b in (at(x, y) for x, y in zip(xs, ys, strict=True))
+    )
     marks = []
     for k in range(5):
         y = low + (high - low) * k / 4
         _, py = at(0, y)
-        marks.append(f'<line class="grid" x1="{left}" x2="{width - right}" y1="{py:.1f}" y2="{py:.1f}"/>')
+        marks.append(
+            f'<line class="grid" x1="{left}" x2="{width - right}" y1="{py:.1f}" y2="{py:.1f}"/>'
+        )
         marks.append(f'<text x="{left - 8}" y="{py + 4:.1f}" text-anchor="end">{y:.2f}</text>')
         x = xs[-1] * k / 4
         px, _ = at(x, low)
         marks.append(f'<text x="{px:.1f}" y="{height - 12}" text-anchor="middle">{x:.0f} s</text>')
     dots = "".join(
-        f'<circle cx="{a:.1f}" cy="{b:.1f}" r="3"/>' for a, b in (at(x, y) for x, y in zip(xs, ys, strict=True))
+        f'<circle cx="{a:.1f}" cy="{b:.1f}" r="3"/>'
+        for a, b in (at(x, y) for x, y in zip(xs, ys, strict=True))
     )
     return (
         f'<svg viewBox="0 0 {width} {height}" role="img" aria-label="PSNR in dB against seconds">'

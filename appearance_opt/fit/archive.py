@@ -1,7 +1,8 @@
 """Values made of dataclasses and arrays on disk, whole or not at all.
 
-An archive is a ZIP file of NumPy arrays, not compressed, and one text that says how the value is built of them. The
-text is data: a reader makes only the classes that it is given, and arrays of plain numbers.
+An archive is a ZIP file of NumPy arrays, not compressed, and one text that says how the value is
+built of them. The text is data: a reader makes only the classes that it is given, and arrays of
+plain numbers.
 """
 
 from __future__ import annotations
@@ -39,11 +40,16 @@ class DamagedError(Exception):
 
 
 def write(path: Path, fingerprint: str, value: object) -> None:
-    """Write to a temporary name, then rename: a killed run leaves the previous archive whole. ``fingerprint``
-    identifies the job. ``value``: None, numbers, text, arrays, and tuples, lists, dictionaries with text as keys and
-    dataclasses of such; every field is kept. Raises TypeError for anything else."""
+    """Write to a temporary name, then rename: a killed run leaves the previous archive whole.
+    ``fingerprint`` identifies the job. ``value``: None, numbers, text, arrays, and tuples, lists,
+    dictionaries with text as keys and dataclasses of such; every field is kept. Raises TypeError
+    for anything else."""
     arrays: dict[str, NDArray] = {}
-    head = {"format": FORMAT, "fingerprint": fingerprint, "value": _describe(value, "value", arrays)}
+    head = {
+        "format": FORMAT,
+        "fingerprint": fingerprint,
+        "value": _describe(value, "value", arrays),
+    }
     handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.stem}-", suffix=TEMPORARY)
     try:
         with os.fdopen(handle, "wb") as file:
@@ -68,9 +74,15 @@ def fingerprint_of(path: Path) -> str:
     return str(_head_of(path)["fingerprint"])
 
 
-def read(path: Path, fingerprint: str, classes: Iterable[type], convert: Callable[[NDArray], Any] | None = None) -> Any:
-    """The value of an archive. ``classes``: dataclasses that it may consist of; ``convert``: what becomes of arrays.
-    Raises InputError when it belongs to another job, DamagedError when it is damaged."""
+def read(
+    path: Path,
+    fingerprint: str,
+    classes: Iterable[type],
+    convert: Callable[[NDArray], Any] | None = None,
+) -> Any:
+    """The value of an archive. ``classes``: dataclasses that it may consist of; ``convert``: what
+    becomes of arrays. Raises InputError when it belongs to another job, DamagedError when it is
+    damaged."""
     head = _head_of(path)
     if head["fingerprint"] != fingerprint:
         raise InputError(
@@ -112,18 +124,27 @@ def _member(packed: zipfile.ZipFile, name: str) -> bytes:
 
 
 def _array(data: bytes) -> NDArray:
-    """A NumPy file (its format version 1.0 or 2.0). Nothing is allocated that the bytes do not hold."""
+    """A NumPy file (its format version 1.0 or 2.0). Nothing is allocated that the bytes do not
+    hold."""
     stream = io.BytesIO(data)
     version = np.lib.format.read_magic(stream)
-    header = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}[version]
+    header = {
+        (1, 0): np.lib.format.read_array_header_1_0,
+        (2, 0): np.lib.format.read_array_header_2_0,
+    }[version]
     shape, fortran, kind = header(stream)
     if kind.hasobject or kind.itemsize * math.prod(shape) != len(data) - stream.tell():
         raise ValueError("an array has another size than it says")
-    return np.frombuffer(data, kind, offset=stream.tell()).reshape(shape, order="F" if fortran else "C").copy()
+    return (
+        np.frombuffer(data, kind, offset=stream.tell())
+        .reshape(shape, order="F" if fortran else "C")
+        .copy()
+    )
 
 
 def _describe(value: Any, name: str, arrays: dict[str, NDArray]) -> Any:
-    """A description of a value in JSON; its arrays go into ``arrays``, named after their place in it."""
+    """A description of a value in JSON; its arrays go into ``arrays``, named after their place in
+    it."""
     if isinstance(value, np.generic):
         value = value.item()
     if value is None or isinstance(value, (bool, int, str)):
@@ -131,12 +152,17 @@ def _describe(value: Any, name: str, arrays: dict[str, NDArray]) -> Any:
     if isinstance(value, float):
         return {"number": repr(value)}  # JSON has no infinity
     if is_dataclass(value) and not isinstance(value, type):
-        parts = {f.name: _describe(getattr(value, f.name), f"{name}/{f.name}", arrays) for f in fields(value)}
+        parts = {
+            f.name: _describe(getattr(value, f.name), f"{name}/{f.name}", arrays)
+            for f in fields(value)
+        }
         return {"class": type(value).__name__, "fields": parts}
     if isinstance(value, dict) and all(isinstance(k, str) for k in value):
         return {"dictionary": {k: _describe(v, f"{name}/{k}", arrays) for k, v in value.items()}}
     if isinstance(value, (tuple, list)):
-        return {type(value).__name__: [_describe(v, f"{name}/{k}", arrays) for k, v in enumerate(value)]}
+        return {
+            type(value).__name__: [_describe(v, f"{name}/{k}", arrays) for k, v in enumerate(value)]
+        }
     array = np.asarray(value)  # a Dr.Jit array, too
     if array.dtype.kind not in "biuf":
         raise TypeError(f"{name}: a {type(value).__name__} cannot be kept")
@@ -145,7 +171,10 @@ def _describe(value: Any, name: str, arrays: dict[str, NDArray]) -> Any:
 
 
 def _rebuild(
-    described: Any, packed: zipfile.ZipFile, classes: dict[str, type], convert: Callable[[NDArray], Any]
+    described: Any,
+    packed: zipfile.ZipFile,
+    classes: dict[str, type],
+    convert: Callable[[NDArray], Any],
 ) -> Any:
     if not isinstance(described, dict):
         return described

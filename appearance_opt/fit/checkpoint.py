@@ -47,7 +47,8 @@ class FitState:
 
 @dataclass
 class Kept:
-    """What is kept of a fit. ``start``: hash of the start that it began with; ``values``: of the parameters."""
+    """What is kept of a fit. ``start``: hash of the start that it began with; ``values``: of the
+    parameters."""
 
     start: str
     values: dict[str, mi.Float]
@@ -57,13 +58,24 @@ class Kept:
 class Checkpointer:
     """Keeps start and state of one job in a folder, the state at most every ``interval`` seconds.
 
-    ``fingerprint`` identifies input and options: a checkpoint of another job is refused. Without ``resume``,
-    checkpoints that are there are removed. Raises InputError when the folder holds anything else.
+    ``fingerprint`` identifies input and options: a checkpoint of another job is refused. Without
+    ``resume``, checkpoints that are there are removed. Raises InputError when the folder holds
+    anything else.
     """
 
-    def __init__(self, folder: Path, fingerprint: str, resume: bool, interval: float = 10.0) -> None:
-        self.folder, self.fingerprint, self.resume, self.interval = Path(folder), fingerprint, resume, interval
-        self.path, self.start_path = self.folder / archive.STATE_FILE, self.folder / archive.START_FILE
+    def __init__(
+        self, folder: Path, fingerprint: str, resume: bool, interval: float = 10.0
+    ) -> None:
+        self.folder, self.fingerprint, self.resume, self.interval = (
+            Path(folder),
+            fingerprint,
+            resume,
+            interval,
+        )
+        self.path, self.start_path = (
+            self.folder / archive.STATE_FILE,
+            self.folder / archive.START_FILE,
+        )
         self.start_hash, self._failed = "", False
         self._last = time.monotonic()
         self.folder.mkdir(parents=True, exist_ok=True)
@@ -91,14 +103,18 @@ class Checkpointer:
                     f"{path}: is no checkpoint, or a damaged one ({error}); delete it, or choose another folder"
                 ) from error
         if self.path in there:
-            log.warning("%s: the checkpoint of an earlier run is removed (--resume goes on from it)", self.folder)
+            log.warning(
+                "%s: the checkpoint of an earlier run is removed (--resume goes on from it)",
+                self.folder,
+            )
         for path in there:
             path.unlink()
 
     def start(self, make: Callable[[], tuple[T, bool]], *classes: type) -> tuple[T, bool]:
-        """(start, interrupted): the one that is kept, if the job is resumed, or one that is made and kept. Made again,
-        it could be another one, as the time that is left decides how often triangles are moved. ``classes``: what it
-        consists of. Raises InputError when the kept one is damaged or belongs to another job."""
+        """(start, interrupted): the one that is kept, if the job is resumed, or one that is made
+        and kept. Made again, it could be another one, as the time that is left decides how often
+        triangles are moved. ``classes``: what it consists of. Raises InputError when the kept one
+        is damaged or belongs to another job."""
         if self.start_path.exists():
             try:
                 start, interrupted = archive.read(self.start_path, self.fingerprint, classes), False
@@ -117,19 +133,21 @@ class Checkpointer:
         return time.monotonic() - self._last >= self.interval
 
     def save(self, model: Model, state: FitState) -> None:
-        """Write the state; see ``archive.write``. Where it cannot be written, the fit is worth more than its
-        checkpoint: this is said once, and the one before stays."""
+        """Write the state; see ``archive.write``. Where it cannot be written, the fit is worth more
+        than its checkpoint: this is said once, and the one before stays."""
         try:
             archive.write(self.path, self.fingerprint, Kept(self.start_hash, model.values(), state))
         except OSError as error:
             if not self._failed:
-                log.warning("%s: cannot be written (%s); the fit goes on without", self.path, error.strerror)
+                log.warning(
+                    "%s: cannot be written (%s); the fit goes on without", self.path, error.strerror
+                )
             self._failed = True
         self._last = time.monotonic()
 
     def restore(self, model: Model, state: FitState) -> bool:
-        """Bring model and state to the checkpoint, if one is to be resumed and exists. Raises InputError
-        when it is damaged or belongs to another job or another start."""
+        """Bring model and state to the checkpoint, if one is to be resumed and exists. Raises
+        InputError when it is damaged or belongs to another job or another start."""
         if not self.resume:
             return False
         if not self.path.exists():
@@ -163,10 +181,16 @@ def _check(kept: Kept, model: Model) -> None:
         raise archive.DamagedError("it holds no state of a fit")
     for name, parameter in model.parameters.items():
         wanted, moments = dr.width(parameter.value), kept.state.moments.get(name)
-        if name not in kept.values or moments is None or name not in (kept.state.best or model.parameters):
+        if (
+            name not in kept.values
+            or moments is None
+            or name not in (kept.state.best or model.parameters)
+        ):
             raise archive.DamagedError(f"it holds no {name}")
         rows = [kept.values[name], moments.first, moments.second, moments.mean]
         rows += [] if kept.state.best is None else [kept.state.best[name]]
         for row in rows:
             if dr.width(row) != wanted:
-                raise archive.DamagedError(f"it holds {dr.width(row)} {name}, the start has {wanted}")
+                raise archive.DamagedError(
+                    f"it holds {dr.width(row)} {name}, the start has {wanted}"
+                )

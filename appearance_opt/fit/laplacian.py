@@ -22,13 +22,15 @@ def edges_of(faces: NDArray) -> NDArray[np.int64]:
 class Laplacian:
     """L = mean over vertices of |delta_i - delta'_i|^2 / h_i^2.
 
-    delta_i = v_i - mean of its one-ring; delta' that of the initial mesh (relative) or 0 (absolute, for
-    a start that is no likeness: a sphere). Unlike in the paper, each vertex is measured in units of h_i,
-    the length of the edges around it at the start, so that the weight means the same for every scale
-    and in dense and coarse regions of one mesh.
+    delta_i = v_i - mean of its one-ring; delta' that of the initial mesh (relative) or 0 (absolute,
+    for a start that is no likeness: a sphere). Unlike in the paper, each vertex is measured in
+    units of h_i, the length of the edges around it at the start, so that the weight means the same
+    for every scale and in dense and coarse regions of one mesh.
     """
 
-    def __init__(self, positions: NDArray, faces: NDArray, edge_length: NDArray, relative: bool) -> None:
+    def __init__(
+        self, positions: NDArray, faces: NDArray, edge_length: NDArray, relative: bool
+    ) -> None:
         pairs = edges_of(faces)
         degree = np.maximum(np.bincount(pairs.ravel(), minlength=len(positions)), 1)
         self._a = mi.UInt32(np.ascontiguousarray(pairs[:, 0], np.uint32))
@@ -36,7 +38,9 @@ class Laplacian:
         self._inverse_degree = mi.Float((1 / degree).astype(np.float32))
         self._scale = mi.Float((1 / edge_length).astype(np.float32))
         self._count = len(positions)
-        self._start = mi.Float(np.ascontiguousarray(positions, np.float32).ravel()) if relative else None
+        self._start = (
+            mi.Float(np.ascontiguousarray(positions, np.float32).ravel()) if relative else None
+        )
 
     def __call__(self, positions: mi.Float) -> mi.Float:
         """The regularizer at flat positions (3 V); width 1, differentiable."""
@@ -48,8 +52,9 @@ class Laplacian:
         return dr.squared_norm(offset) / self._count
 
     def _delta(self, positions: mi.Float) -> mi.Vector3f:
-        """delta - delta', which is linear: of how far the vertices have moved. Where none around a vertex has, it is
-        exactly 0; as a difference of two sums it would be rounding, of which Adam makes whole steps."""
+        """delta - delta', which is linear: of how far the vertices have moved. Where none around a
+        vertex has, it is exactly 0; as a difference of two sums it would be rounding, of which Adam
+        makes whole steps."""
         total = dr.zeros(mi.Float, 3 * self._count)
         dr.scatter_add(total, self._moved(positions, self._b), self._a)
         dr.scatter_add(total, self._moved(positions, self._a), self._b)

@@ -38,7 +38,8 @@ MAX_BAD_STEPS = 10
 """Consecutive steps with non-finite gradients after which a fit gives up."""
 
 LOOKING = 0.1
-"""Largest part of a time budget that is spent on looking at the held-out views: short fits look less often."""
+"""Largest part of a time budget that is spent on looking at the held-out views: short fits look
+less often."""
 
 LOSS_EVERY = 8
 """Steps between two evaluations of the loss: it is only shown, the gradient does not need it."""
@@ -52,13 +53,14 @@ Background = str | tuple[float, float, float]
 
 @dataclass(frozen=True)
 class FitOptions:
-    """How to fit. ``steps``/``seconds``: when to stop (at least one, or ValueError). ``loss``: a name of
-    ``losses.LOSSES``. ``laplacian``: weight relative to the first image loss, at a deviation of a tenth of an edge
-    length (0: none). ``relative``: the start is a likeness: hold its Laplacian rather than 0, and hand out no triangle
-    that has turned over since (see ``folds``). ``decay``: powers of ten by which
-    the rates fall over the fit. ``background``: behind latent and reference. ``quality``: how the latent is sampled;
-    its point width is the pool's. ``validate_every``: fraction of the fit between looks at the held-out views.
-    ``seed``: of backgrounds, tessellation levels and silhouette points; views have the sampler's."""
+    """How to fit. ``steps``/``seconds``: when to stop (at least one, or ValueError). ``loss``: a
+    name of ``losses.LOSSES``. ``laplacian``: weight relative to the first image loss, at a
+    deviation of a tenth of an edge length (0: none). ``relative``: the start is a likeness: hold
+    its Laplacian rather than 0, and hand out no triangle that has turned over since (see
+    ``folds``). ``decay``: powers of ten by which the rates fall over the fit. ``background``:
+    behind latent and reference. ``quality``: how the latent is sampled; its point width is the
+    pool's. ``validate_every``: fraction of the fit between looks at the held-out views. ``seed``:
+    of backgrounds, tessellation levels and silhouette points; views have the sampler's."""
 
     steps: int | None = None
     seconds: float | None = None
@@ -88,8 +90,8 @@ class CurvePoint:
 
 @dataclass
 class FitResult:
-    """What a fit did. The model is left at its best state by held-out PSNR, the start included. ``unfolded``: triangles
-    of that state that had turned over and were turned back."""
+    """What a fit did. The model is left at its best state by held-out PSNR, the start included.
+    ``unfolded``: triangles of that state that had turned over and were turned back."""
 
     curve: list[CurvePoint] = field(default_factory=list)
     steps: int = 0
@@ -112,13 +114,19 @@ class FitResult:
 
 
 class Progress(Protocol):
-    """Told of what a job does: ``stage`` when it begins with something that may take long, in a few words, and
-    ``update`` after every step of a fit and every look at the held-out views."""
+    """Told of what a job does: ``stage`` when it begins with something that may take long, in a few
+    words, and ``update`` after every step of a fit and every look at the held-out views."""
 
     def stage(self, text: str) -> None: ...
 
     def update(
-        self, step: int, fraction: float, loss: float, psnr: float, steps_per_second: float, seconds_left: float | None
+        self,
+        step: int,
+        fraction: float,
+        loss: float,
+        psnr: float,
+        steps_per_second: float,
+        seconds_left: float | None,
     ) -> None: ...
 
 
@@ -131,8 +139,9 @@ def fit(
     checkpointer: Checkpointer | None = None,
     stop: Callable[[], bool] | None = None,
 ) -> FitResult:
-    """Fit the model to the pool's reference. ``stop``: asked before every step whether the fit shall end early. A
-    KeyboardInterrupt ends it in the same way. Raises DivergedError (the model then holds the best state)."""
+    """Fit the model to the pool's reference. ``stop``: asked before every step whether the fit
+    shall end early. A KeyboardInterrupt ends it in the same way. Raises DivergedError (the model
+    then holds the best state)."""
     run = _Run(model, pool, validation, options, progress, checkpointer)
     try:
         if run.state.best is None:
@@ -201,17 +210,21 @@ class _Run:
             laplacian_weight=laplacian_weight(state.laplacian, fraction),
             rate=learning_rate(fraction, options.decay),
             seed=seed_of(options.seed, state.iteration),
-            want_loss=state.iteration % LOSS_EVERY == 0 or (bool(self.laplacians) and state.laplacian == 0),
+            want_loss=state.iteration % LOSS_EVERY == 0
+            or (bool(self.laplacians) and state.laplacian == 0),
         )
         done = step(self.gradients, state.moments, inputs, first_non_finite)
         self._count(done.bad)
         if done.bad is None and done.loss is not None:
             state.loss = done.loss
             if state.laplacian == 0 and self.model.level in self.laplacians:
-                # a deviation of a tenth of an edge length costs this fraction of the first image loss
+                # a deviation of a tenth of an edge length costs this fraction of the first image
+                # loss
                 state.laplacian = options.laplacian * done.loss / 0.01
         self._commit(done)
-        if self.clock.progress(state.iteration) >= self.next_look and not self.clock.done(state.iteration):
+        if self.clock.progress(state.iteration) >= self.next_look and not self.clock.done(
+            state.iteration
+        ):
             self._look_and_pause()
         self._report()
         if self.checkpointer is not None and self.checkpointer.due():
@@ -245,7 +258,8 @@ class _Run:
             state.unfolded = unfolded
 
     def _unfold(self) -> int:
-        """Turn folded triangles back, of the means and of where the next step starts. How many the means had."""
+        """Turn folded triangles back, of the means and of where the next step starts. How many the
+        means had."""
         if self.folds is None or self.state.best is None:
             return 0
         parameter, moments = self.model.parameters[POSITIONS], self.state.moments[POSITIONS]
@@ -276,8 +290,8 @@ class _Run:
             self.checkpointer.save(self.model, self.state)
 
     def _commit(self, done: StepResult) -> None:
-        """Take the step, or only count it if its gradient was bad. Values, moments and iteration change together,
-        before anything slow."""
+        """Take the step, or only count it if its gradient was bad. Values, moments and iteration
+        change together, before anything slow."""
         for name, value in done.values.items():
             self.model.parameters[name].value = value
         self.state.moments.update(done.moments)
@@ -291,7 +305,9 @@ class _Run:
             return
         self.state.skipped += 1
         self.bad_steps += 1
-        log.warning("step %d skipped: the gradient of '%s' is not finite", self.state.iteration, bad)
+        log.warning(
+            "step %d skipped: the gradient of '%s' is not finite", self.state.iteration, bad
+        )
         if self.bad_steps >= MAX_BAD_STEPS:
             raise DivergedError(
                 f"the gradient of '{bad}' was not finite for {self.bad_steps} steps up to iteration "
@@ -306,7 +322,12 @@ class _Run:
         fraction = self.clock.progress(state.iteration)
         left = seconds * (1 - fraction) / fraction if fraction > 0 else None
         self.progress.update(
-            state.iteration, fraction, state.loss, self.psnr, state.iteration / max(seconds, 1e-9), left
+            state.iteration,
+            fraction,
+            state.loss,
+            self.psnr,
+            state.iteration / max(seconds, 1e-9),
+            left,
         )
 
 
@@ -323,15 +344,20 @@ def level_of(levels: tuple[int, ...], seed: int, iteration: int) -> int:
 
 
 def laplacians(model: Model, relative: bool) -> dict[int, Laplacian]:
-    """The regularizer of each tessellation level, on the displaced mesh, relative to it as it is now."""
+    """The regularizer of each tessellation level, on the displaced mesh, relative to it as it is
+    now."""
     out = {}
     for level in model.levels:
         mesh, positions = model.host_drawn(level)
-        out[level] = Laplacian(positions, mesh.faces, local_edge_length(positions, mesh.faces), relative)
+        out[level] = Laplacian(
+            positions, mesh.faces, local_edge_length(positions, mesh.faces), relative
+        )
     return out
 
 
-def backgrounds(background: Background, count: int, seed: int, iteration: int) -> NDArray[np.float32]:
+def backgrounds(
+    background: Background, count: int, seed: int, iteration: int
+) -> NDArray[np.float32]:
     """(count, 3) linear colours behind the views of an iteration. Random ones make every silhouette
     visible, whatever the colour of the object."""
     if background == "random":

@@ -1,7 +1,7 @@
 """Image losses: per-pixel values and their derivative by the rendered image.
 
-All work on linear radiance composited over a background, and are averaged over pixels and channels by
-the caller.
+All work on linear radiance composited over a background, and are averaged over pixels and channels
+by the caller.
 """
 
 from __future__ import annotations
@@ -28,7 +28,9 @@ if TYPE_CHECKING:
 
 def srgb(x: mi.Color3f) -> mi.Color3f:
     """sRGB transfer function (IEC 61966-2-1), continued above 1."""
-    return dr.select(x <= 0.0031308, 12.92 * x, 1.055 * dr.power(at_least_color(x, 0.0031308), 1 / 2.4) - 0.055)
+    return dr.select(
+        x <= 0.0031308, 12.92 * x, 1.055 * dr.power(at_least_color(x, 0.0031308), 1 / 2.4) - 0.055
+    )
 
 
 def tone_map(x: mi.Color3f) -> mi.Color3f:
@@ -37,7 +39,8 @@ def tone_map(x: mi.Color3f) -> mi.Color3f:
 
 
 def log1p(x: mi.Color3f) -> mi.Color3f:
-    """log(1 + x) of non-negative x with all digits of small ones: by its series below 0.1 (error 2e-8)."""
+    """log(1 + x) of non-negative x with all digits of small ones: by its series below 0.1 (error
+    2e-8)."""
     small = at_most_color(x, 0.1)
     series = mi.Color3f(1 / 7)
     for k in range(6, 0, -1):
@@ -104,9 +107,9 @@ def loss_of_name(name: str) -> Loss:
 
 @dataclass(frozen=True)
 class Target:
-    """What a batch of images is compared with: ``reference`` (pixels * 4) premultiplied linear RGB and coverage;
-    ``background`` (views * 4) linear RGB and padding, the colour behind each view; ``pixels_per_view``; ``share``: of
-    one channel of a pixel in the mean over all."""
+    """What a batch of images is compared with: ``reference`` (pixels * 4) premultiplied linear RGB
+    and coverage; ``background`` (views * 4) linear RGB and padding, the colour behind each view;
+    ``pixels_per_view``; ``share``: of one channel of a pixel in the mean over all."""
 
     reference: mi.Float
     background: mi.Float
@@ -130,23 +133,28 @@ class Target:
 
 
 def covered_loss(loss: Loss, target: Target, color: mi.Color3f, pixel: mi.UInt32) -> mi.Float:
-    """Share of the mean loss of a batch that falls on fully covered pixels of radiance ``color``, one value per
-    pixel, differentiable."""
+    """Share of the mean loss of a batch that falls on fully covered pixels of radiance ``color``,
+    one value per pixel, differentiable."""
     return _sum_channels(loss(color, target.colors(pixel)[0])) * target.share
 
 
 def compared_pixels(image: mi.Float, target: Target, complete: mi.Bool | None = None) -> mi.UInt32:
-    """Indices of the pixels of an image (pixels * 4) that can differ from the target: where neither is covered both
-    show the background. ``complete``: (pixels,) pixels to look at (all)."""
+    """Indices of the pixels of an image (pixels * 4) that can differ from the target: where neither
+    is covered both show the background. ``complete``: (pixels,) pixels to look at (all)."""
     i = dr.arange(mi.UInt32, dr.width(image) // 4)
-    either = (dr.gather(mi.Float, image, 4 * i + 3) > 0) | (dr.gather(mi.Float, target.reference, 4 * i + 3) > 0)
+    either = (dr.gather(mi.Float, image, 4 * i + 3) > 0) | (
+        dr.gather(mi.Float, target.reference, 4 * i + 3) > 0
+    )
     return dr.compress(either if complete is None else either & complete)
 
 
-def image_loss(loss: Loss, target: Target, image: mi.Float, pixels: mi.UInt32, total: int) -> tuple[mi.Float, mi.Float]:
-    """Loss of some ``pixels`` (indices, at least one) of an image of ``total`` pixels (premultiplied linear RGB and
-    coverage), and its derivative by the image. Returns (values, one per entry of ``pixels``, whose sum is their share
-    of the mean over all pixels; gradient as wide as ``image``)."""
+def image_loss(
+    loss: Loss, target: Target, image: mi.Float, pixels: mi.UInt32, total: int
+) -> tuple[mi.Float, mi.Float]:
+    """Loss of some ``pixels`` (indices, at least one) of an image of ``total`` pixels
+    (premultiplied linear RGB and coverage), and its derivative by the image. Returns (values, one
+    per entry of ``pixels``, whose sum is their share of the mean over all pixels; gradient as wide
+    as ``image``)."""
     value = dr.gather(mi.ArrayXf, dr.detach(image), pixels, shape=(4, dr.width(pixels)))
     dr.enable_grad(value)
     reference, behind = target.colors(pixels)

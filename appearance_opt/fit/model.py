@@ -31,8 +31,8 @@ POSITIONS, TEXELS = "positions", "texels"
 @dataclass(frozen=True)
 class Rates:
     """Learning rates at the start of a fit. ``position``: in units of the local edge length;
-    ``displacement``: in units of the mean edge length of the finest tessellation; the others in the units
-    of their maps (colours: square root of linear)."""
+    ``displacement``: in units of the mean edge length of the finest tessellation; the others in the
+    units of their maps (colours: square root of linear)."""
 
     position: float = 0.01
     normal: float = 0.01
@@ -49,19 +49,24 @@ class Rates:
 
 @dataclass(frozen=True)
 class Shape:
-    """Where the drawn mesh is, on the device: flat base ``positions`` (3 V) and the pyramid ``relief`` of the
-    displacement map, None without one. Either may carry gradients."""
+    """Where the drawn mesh is, on the device: flat base ``positions`` (3 V) and the pyramid
+    ``relief`` of the displacement map, None without one. Either may carry gradients."""
 
     positions: mi.Float
     relief: TexelLayer | None
 
 
 class Drawn:
-    """One tessellation level, ready to be traced. Level 0 without displacement is the latent mesh itself."""
+    """One tessellation level, ready to be traced. Level 0 without displacement is the latent mesh
+    itself."""
 
     def __init__(self, mesh: LatentMesh, level: int, displaced: bool, tangents: bool) -> None:
         self.tessellator = Tessellator(mesh, level, tangents) if displaced or level else None
-        self.topology = LatentTopology(mesh, tangents) if self.tessellator is None else self.tessellator.topology
+        self.topology = (
+            LatentTopology(mesh, tangents)
+            if self.tessellator is None
+            else self.tessellator.topology
+        )
         drawn = self.topology.mesh
         self.edge_length = local_edge_length(drawn.positions, drawn.faces)
         self._moving = upload.MovingScene(drawn.positions, drawn.faces, self.topology.culled)
@@ -69,7 +74,11 @@ class Drawn:
 
     def pose(self, shape: Shape) -> mi.Float:
         """Flat positions (3 N) of the drawn mesh; differentiable."""
-        return shape.positions if self.tessellator is None else self.tessellator(shape.positions, shape.relief)
+        return (
+            shape.positions
+            if self.tessellator is None
+            else self.tessellator(shape.positions, shape.relief)
+        )
 
     def move(self, posed: mi.Float) -> None:
         """Rebuild the BVH at the given positions."""
@@ -80,10 +89,10 @@ class Model:
     """A latent mesh with maps, of which the parts named in ``fit`` are parameters.
 
     ``fit``: subset of {"shape", "normal", "material", "displacement"}. ``maps``: natural values of
-    every map the latent has, channel name -> (size, size), or a number for a channel that is constant. Maps
-    that are not fitted are kept in a layer of their own, without gradients or moments. The map
-    "displacement" has a size of its own; with it, or with ``levels`` other than (0,), the mesh is
-    drawn tessellated, at one of ``levels`` at a time (``select``).
+    every map the latent has, channel name -> (size, size), or a number for a channel that is
+    constant. Maps that are not fitted are kept in a layer of their own, without gradients or
+    moments. The map "displacement" has a size of its own; with it, or with ``levels`` other than
+    (0,), the mesh is drawn tessellated, at one of ``levels`` at a time (``select``).
     """
 
     def __init__(
@@ -98,14 +107,20 @@ class Model:
         self.constants = {n: float(v) for n, v in maps.items() if not np.ndim(v)}
         fitted = tuple(n for n in images if _group(n) in fit)
         self.mesh, self.levels, self.level = mesh, levels, levels[-1]
-        self._drawn = {k: Drawn(mesh, k, DISPLACEMENT in maps, "normal_x" in images) for k in levels}
+        self._drawn = {
+            k: Drawn(mesh, k, DISPLACEMENT in maps, "normal_x" in images) for k in levels
+        }
         self.edge_length = local_edge_length(mesh.positions, mesh.faces)
         self._fixed_positions = mi.Float(np.ascontiguousarray(mesh.positions, np.float32).ravel())
         self.parameters: dict[str, Parameter] = {}
         if "shape" in fit:
-            self.parameters[POSITIONS] = Parameter(POSITIONS, mi.Float(self._fixed_positions), 1, mi.Float(0))
+            self.parameters[POSITIONS] = Parameter(
+                POSITIONS, mi.Float(self._fixed_positions), 1, mi.Float(0)
+            )
         self.codec = self._texel_parameter(TEXELS, fitted, images) if fitted else None
-        self._initial_texels = np.array(self.parameters[TEXELS].value) if fitted else np.empty(0, np.float32)
+        self._initial_texels = (
+            np.array(self.parameters[TEXELS].value) if fitted else np.empty(0, np.float32)
+        )
         self._fixed_layers: tuple[TexelLayer, ...] = ()
         self._fixed_maps = {n: v.astype(np.float32) for n, v in images.items() if n not in fitted}
         if self._fixed_maps:
@@ -121,7 +136,9 @@ class Model:
             if drawn.tessellator is not None:  # without one, the scene was made where it is
                 drawn.move(drawn.pose(self.shape()))
 
-    def _texel_parameter(self, name: str, channels: tuple[str, ...], images: Mapping[str, NDArray]) -> TexelCodec:
+    def _texel_parameter(
+        self, name: str, channels: tuple[str, ...], images: Mapping[str, NDArray]
+    ) -> TexelCodec:
         codec = TexelCodec(channels, len(images[channels[0]]))
         self.parameters[name] = Parameter(
             name,
@@ -178,7 +195,8 @@ class Model:
             self.parameters[DISPLACEMENT].rate = mi.Float(edge * rates.displacement)
 
     def precondition(self, strength: float, rate: float) -> None:
-        """Smooth the steps of the positions (see ``fit.smoothing``), with a ``rate`` in units of the positions."""
+        """Smooth the steps of the positions (see ``fit.smoothing``), with a ``rate`` in units of
+        the positions."""
         parameter = self.parameters.get(POSITIONS)
         if parameter is not None:
             parameter.smooth = Smoother(len(self.mesh.positions), self.mesh.faces, strength)
@@ -186,7 +204,11 @@ class Model:
 
     def positions(self) -> mi.Float:
         """Current flat base positions (3 V)."""
-        return self.parameters[POSITIONS].value if POSITIONS in self.parameters else self._fixed_positions
+        return (
+            self.parameters[POSITIONS].value
+            if POSITIONS in self.parameters
+            else self._fixed_positions
+        )
 
     def shape(self) -> Shape:
         """What places the drawn mesh, as it is now."""
@@ -213,13 +235,18 @@ class Model:
             relief = _track(relief)
         return Shape(positions, relief), None if layer is None else _track(layer)
 
-    def gradients(self, shape: Shape, layer: TexelLayer | None, values: Mapping[str, mi.Float]) -> dict[str, mi.Float]:
-        """Gradients of the parameters, which have the given ``values``, after the backward pass of a tracked shape
-        and layer."""
+    def gradients(
+        self, shape: Shape, layer: TexelLayer | None, values: Mapping[str, mi.Float]
+    ) -> dict[str, mi.Float]:
+        """Gradients of the parameters, which have the given ``values``, after the backward pass of
+        a tracked shape and layer."""
         out = {}
         if POSITIONS in values:
             out[POSITIONS] = dr.grad(shape.positions)
-        for name, codec, tracked in ((DISPLACEMENT, self._relief_codec, shape.relief), (TEXELS, self.codec, layer)):
+        for name, codec, tracked in (
+            (DISPLACEMENT, self._relief_codec, shape.relief),
+            (TEXELS, self.codec, layer),
+        ):
             if name in values:
                 assert codec is not None and tracked is not None
                 out[name] = codec.pull_back(dr.grad(tracked.pyramid.texels), values[name])
@@ -285,11 +312,14 @@ class Model:
     def changed(self) -> NDArray[np.bool_]:
         """(size, size) texels that differ from those of the start. Needs fitted maps."""
         assert self.codec is not None
-        texels = np.array(self.parameters[TEXELS].value).reshape(self.codec.size, self.codec.size, -1)
+        texels = np.array(self.parameters[TEXELS].value).reshape(
+            self.codec.size, self.codec.size, -1
+        )
         return (texels != self._initial_texels.reshape(texels.shape)).any(axis=-1)
 
     def values(self) -> dict[str, mi.Float]:
-        """Snapshot of all parameters (arrays are never changed in place, so this copies nothing)."""
+        """Snapshot of all parameters (arrays are never changed in place, so this copies
+        nothing)."""
         return {name: p.value for name, p in self.parameters.items()}
 
     def restore(self, values: Mapping[str, mi.Float]) -> None:

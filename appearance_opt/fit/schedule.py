@@ -9,8 +9,8 @@ from dataclasses import dataclass, field
 
 @dataclass
 class Clock:
-    """Progress of a fit that ends after ``steps`` iterations, after ``seconds`` of wall-clock time, or at
-    whichever comes first. ``elapsed`` seconds are carried over by a resumed fit."""
+    """Progress of a fit that ends after ``steps`` iterations, after ``seconds`` of wall-clock time,
+    or at whichever comes first. ``elapsed`` seconds are carried over by a resumed fit."""
 
     steps: int | None
     seconds: float | None
@@ -37,18 +37,20 @@ class Clock:
 def learning_rate(progress: float, decades: float) -> float:
     """Exponential decay by ``decades`` powers of ten over the fit, after a short warm-up.
 
-    The paper decays by 10^(-0.0002 t), two decades over its 10,000 steps; here the decay follows the
-    progress, so that short and long fits both end with small steps.
+    The paper decays by 10^(-0.0002 t), two decades over its 10,000 steps; here the decay follows
+    the progress, so that short and long fits both end with small steps.
     """
     warm_up = min(1.0, progress / 0.01 + 0.1)
     return warm_up * 10.0 ** (-decades * progress)
 
 
-def laplacian_weight(initial: float, progress: float, steps: float = 10_000.0, rate: float = 1e-6) -> float:
-    """lambda_t after t = progress * steps iterations of the paper's recursion
-    lambda_t = (lambda_{t-1} - lambda_min) 10^(-k t) + lambda_min, lambda_min = 2 % of lambda_0 (Hasselgren et
-    al. 2021, section 3.3): in closed form the exponents add up to k t (t + 1) / 2. The paper's 10,000 steps
-    are stretched or squeezed to the length of the fit."""
+def laplacian_weight(
+    initial: float, progress: float, steps: float = 10_000.0, rate: float = 1e-6
+) -> float:
+    """lambda_t after t = progress * steps iterations of the paper's recursion lambda_t =
+    (lambda_{t-1} - lambda_min) 10^(-k t) + lambda_min, lambda_min = 2 % of lambda_0 (Hasselgren et
+    al. 2021, section 3.3): in closed form the exponents add up to k t (t + 1) / 2. The paper's
+    10,000 steps are stretched or squeezed to the length of the fit."""
     t = progress * steps
     floor = 0.02 * initial
     return (initial - floor) * math.pow(10.0, -rate * t * (t + 1) / 2) + floor

@@ -32,8 +32,8 @@ if TYPE_CHECKING:
 @dataclass(frozen=True)
 class StepInputs:
     """What a step sees: ``views`` and their ``reference`` images (flat, on the device), the
-    ``background`` behind each view (B, 3) linear, and the current weights and rate. ``want_loss``: the gradient
-    does not need the value of the loss; evaluating it shades all samples once more."""
+    ``background`` behind each view (B, 3) linear, and the current weights and rate. ``want_loss``:
+    the gradient does not need the value of the loss; evaluating it shades all samples once more."""
 
     views: Views
     reference: Targets
@@ -46,8 +46,9 @@ class StepInputs:
 
 @dataclass(frozen=True)
 class StepResult:
-    """``loss``: mean image loss, or None when it was not wanted. ``bad``: name of the parameter whose gradient
-    was not finite, or None. ``values`` and ``moments`` after the step, by parameter; both empty if one was bad."""
+    """``loss``: mean image loss, or None when it was not wanted. ``bad``: name of the parameter
+    whose gradient was not finite, or None. ``values`` and ``moments`` after the step, by parameter;
+    both empty if one was bad."""
 
     loss: float | None
     bad: str | None
@@ -58,8 +59,9 @@ class StepResult:
 class Gradients:
     """The gradients of a model, as a function of the views and images of a step.
 
-    ``laplacians``: the regularizer of each tessellation level, if any. ``freeze``: record the kernels of the first
-    steps and launch them again without tracing (see ``render.freezing``); results are the same to rounding.
+    ``laplacians``: the regularizer of each tessellation level, if any. ``freeze``: record the
+    kernels of the first steps and launch them again without tracing (see ``render.freezing``);
+    results are the same to rounding.
     """
 
     def __init__(
@@ -73,11 +75,17 @@ class Gradients:
     ) -> None:
         self.model, self.grid, self.quality, self.loss = model, grid, quality, loss
         self.laplacians = laplacians or {}
-        self._edges = {level: t.walkable if quality.walks else t.edges for level, t in model.topologies().items()}
-        self._run: Run = Frozen(model.fixed(), self.laplacians, grid, self._edges) if freeze else traced
+        self._edges = {
+            level: t.walkable if quality.walks else t.edges
+            for level, t in model.topologies().items()
+        }
+        self._run: Run = (
+            Frozen(model.fixed(), self.laplacians, grid, self._edges) if freeze else traced
+        )
 
     def __call__(self, inputs: StepInputs) -> tuple[mi.Float | None, dict[str, mi.Float]]:
-        """Mean image loss (width 1; None without ``want_loss``) and the gradient of every parameter."""
+        """Mean image loss (width 1; None without ``want_loss``) and the gradient of every
+        parameter."""
         model, grid, run = self.model, self.grid, self._run
         records = inputs.views.records()
         target = Target.of(inputs.reference.average, inputs.background)
@@ -87,10 +95,20 @@ class Gradients:
             surface = run(self._surface, model.level, shape)
         edges = self._edges[model.level]
         batch = gradient.render(
-            model.scene, surface, model.maps(layer), edges, records, grid, self.quality, inputs.seed, True, run
+            model.scene,
+            surface,
+            model.maps(layer),
+            edges,
+            records,
+            grid,
+            self.quality,
+            inputs.seed,
+            True,
+            run,
         )
-        # Only averaged pixels have a gradient here. Of one ray per pixel these are the crossed ones; of several rays
-        # also those that are covered in part without being crossed. The value of the loss needs all pixels.
+        # Only averaged pixels have a gradient here. Of one ray per pixel these are the crossed
+        # ones; of several rays also those that are covered in part without being crossed. The value
+        # of the loss needs all pixels.
         some = batch.crossed
         if inputs.want_loss or batch.deferred is None or self.quality.samples > 1:
             some = compared_pixels(batch.image, target, batch.complete())
@@ -125,7 +143,8 @@ class Gradients:
         return self.model.shape_of(stored), self.model.layer_of(stored)
 
     def _surface(self, level: int, shape: Shape) -> Surface:
-        """The surface, without gradients. ``level``: the one that the model draws; each has recordings of its own."""
+        """The surface, without gradients. ``level``: the one that the model draws; each has
+        recordings of its own."""
         return self.model.surface(self.model.drawn.pose(shape))
 
     def _pulled_back(
@@ -140,7 +159,8 @@ class Gradients:
         laplacian_weight: mi.Float,
         want_loss: bool,
     ) -> tuple[mi.Float | None, dict[str, mi.Float]]:
-        """(loss of the deferred pixels, gradient of every parameter). ``level``: as in ``_surface``."""
+        """(loss of the deferred pixels, gradient of every parameter). ``level``: as in
+        ``_surface``."""
         model, edges = self.model, self._edges[level]
         shape, layer = model.track(shape, layer)
         posed = model.drawn.pose(shape)
@@ -166,20 +186,22 @@ def step(
     inputs: StepInputs,
     check: Callable[[dict[str, mi.Float]], str | None],
 ) -> StepResult:
-    """Where one step takes every parameter; nothing is moved here, so that an interruption leaves no half a step.
-    ``check`` names a bad gradient."""
+    """Where one step takes every parameter; nothing is moved here, so that an interruption leaves
+    no half a step. ``check`` names a bad gradient."""
     value, grads = gradients(inputs)
     bad = check(grads)
     values, after = {}, {}
     if bad is None:
         for name, parameter in gradients.model.parameters.items():
-            values[name], after[name] = adam.update(parameter, grads[name], moments[name], inputs.rate)
+            values[name], after[name] = adam.update(
+                parameter, grads[name], moments[name], inputs.rate
+            )
     return StepResult(None if value is None else float(value[0]), bad, values, after)
 
 
 def first_non_finite(grads: dict[str, mi.Float]) -> str | None:
-    """Name of the first parameter with a NaN or infinite gradient, or None. A sum is finite only if all
-    its terms are: one reduction instead of a test per element."""
+    """Name of the first parameter with a NaN or infinite gradient, or None. A sum is finite only if
+    all its terms are: one reduction instead of a test per element."""
     sums = {name: dr.sum(g) for name, g in grads.items()}
     dr.eval(sums)
     for name, total in sums.items():

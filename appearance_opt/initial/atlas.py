@@ -17,31 +17,41 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 GUTTER = 4
-"""Empty texels between charts, enough for one mip level and its bilinear lookups. With half as many, or half as many
-again, starts of chess_king, spot and flight_helmet are 0.12 dB worse to 0.04 dB better."""
+"""Empty texels between charts, enough for one mip level and its bilinear lookups. With half as
+many, or half as many again, starts of chess_king, spot and flight_helmet are 0.12 dB worse to 0.04
+dB better."""
 
 FLATTEST = 1e-2
 """Height of the chart of a single thin face at the least, as a part of its longest side."""
 
 FILLED, TRIES, SMALLEST = 0.6, 3, 0.5
-"""First guess at the share of a texture that charts fill, how often the length of texels that follows from it is
-corrected, and down to which part of it. Beyond that the gutters become narrower."""
+"""First guess at the share of a texture that charts fill, how often the length of texels that
+follows from it is corrected, and down to which part of it. Beyond that the gutters become
+narrower."""
 
 
 def unwrap(
-    positions: NDArray, faces: NDArray, resolution: int, gutter: int = GUTTER, single: NDArray | None = None
+    positions: NDArray,
+    faces: NDArray,
+    resolution: int,
+    gutter: int = GUTTER,
+    single: NDArray | None = None,
 ) -> LatentMesh:
-    """Charts for all faces, with equally many texels per area, packed for a texture of ``resolution`` texels."""
-    return pack_charts(make_charts(positions, faces, single), np.ones(len(faces)), resolution, gutter)
+    """Charts for all faces, with equally many texels per area, packed for a texture of
+    ``resolution`` texels."""
+    return pack_charts(
+        make_charts(positions, faces, single), np.ones(len(faces)), resolution, gutter
+    )
 
 
 def make_charts(positions: NDArray, faces: NDArray, single: NDArray | None = None) -> LatentMesh:
-    """Charts for all faces. UVs are as long as what they stand for (in units of the longest side of the mesh's box),
-    and charts lie side by side, anywhere. ``single`` (F,): faces that are seen from their front only, None for none;
-    where such sheets lie back to back, each side gets vertices and charts of its own (see ``sheets``).
+    """Charts for all faces. UVs are as long as what they stand for (in units of the longest side of
+    the mesh's box), and charts lie side by side, anywhere. ``single`` (F,): faces that are seen
+    from their front only, None for none; where such sheets lie back to back, each side gets
+    vertices and charts of its own (see ``sheets``).
 
-    glTF convention (v downward). Render vertices are also split where a vertex lies on charts of both
-    handednesses, so that each has one tangent basis.
+    glTF convention (v downward). Render vertices are also split where a vertex lies on charts of
+    both handednesses, so that each has one tangent basis.
     """
     import xatlas
 
@@ -55,13 +65,17 @@ def make_charts(positions: NDArray, faces: NDArray, single: NDArray | None = Non
     parts = [np.flatnonzero(~sheets.behind), np.flatnonzero(sheets.behind)]
     parts = [own for own in parts if len(own)]
     for own in parts:
-        atlas.add_mesh(np.ascontiguousarray(unit), np.ascontiguousarray(sheets.faces[own], np.uint32))
+        atlas.add_mesh(
+            np.ascontiguousarray(unit), np.ascontiguousarray(sheets.faces[own], np.uint32)
+        )
     chart = xatlas.ChartOptions()
     chart.max_iterations = 2
     atlas.generate(chart_options=chart, pack_options=_pack_options(1024, GUTTER, 0.0))
     vertex, frames, uvs = _join(atlas, parts)
     # xatlas stretches the texture, which is as wide and high as it likes, to the unit square
-    side = np.array([atlas.width, atlas.height], np.float32) / np.float32(max(atlas.texels_per_unit, 1e-30))
+    side = np.array([atlas.width, atlas.height], np.float32) / np.float32(
+        max(atlas.texels_per_unit, 1e-30)
+    )
     charts = LatentMesh(
         positions=np.asarray(sheets.positions, np.float32),
         faces=np.asarray(sheets.faces, np.int32),
@@ -71,12 +85,18 @@ def make_charts(positions: NDArray, faces: NDArray, single: NDArray | None = Non
         single=single if single is not None and single.any() else None,
     )
     left = uv_areas(charts) <= 0
-    return _with_single_faces(charts, left, (sheets.positions - centre) / scale) if left.any() else charts
+    return (
+        _with_single_faces(charts, left, (sheets.positions - centre) / scale)
+        if left.any()
+        else charts
+    )
 
 
-def _with_single_faces(charts: LatentMesh, left: NDArray[np.bool_], positions: NDArray) -> LatentMesh:
-    """The charts, and one for each of the faces that are ``left``: xatlas gives none to faces whose area it takes for
-    nothing. ``positions`` (V, 3) in the units of the charts."""
+def _with_single_faces(
+    charts: LatentMesh, left: NDArray[np.bool_], positions: NDArray
+) -> LatentMesh:
+    """The charts, and one for each of the faces that are ``left``: xatlas gives none to faces whose
+    area it takes for nothing. ``positions`` (V, 3) in the units of the charts."""
     corners = charts.faces[left]
     # with the longest side first, and no lower than ``FLATTEST`` of it
     p = positions[corners]
@@ -104,7 +124,8 @@ def _with_single_faces(charts: LatentMesh, left: NDArray[np.bool_], positions: N
 
 
 def _join(atlas: xatlas.Atlas, parts: list[NDArray]) -> tuple[NDArray, NDArray, NDArray]:
-    """(vertex of each render vertex, faces, UVs) of all meshes of an atlas, the faces at the numbers ``parts``."""
+    """(vertex of each render vertex, faces, UVs) of all meshes of an atlas, the faces at the
+    numbers ``parts``."""
     if len(parts) == 1:
         return atlas[0]
     meshes = [atlas[k] for k in range(len(parts))]
@@ -118,10 +139,11 @@ def _join(atlas: xatlas.Atlas, parts: list[NDArray]) -> tuple[NDArray, NDArray, 
 def pack_charts(
     charts: LatentMesh, scale: NDArray, resolution: int, gutter: int = GUTTER, tight: bool = False
 ) -> LatentMesh:
-    """What ``make_charts`` made, packed into the unit square for a texture of ``resolution`` texels, ``gutter`` of them
-    empty between charts. ``scale`` (F,): how long and wide each face is to be relative to the others; the same for all
-    faces of a chart. Charts are turned, and may be mirrored. ``tight`` searches all places for each chart: up to a
-    quarter more texels per area, for one or two seconds."""
+    """What ``make_charts`` made, packed into the unit square for a texture of ``resolution``
+    texels, ``gutter`` of them empty between charts. ``scale`` (F,): how long and wide each face is
+    to be relative to the others; the same for all faces of a chart. Charts are turned, and may be
+    mirrored. ``tight`` searches all places for each chart: up to a quarter more texels per area,
+    for one or two seconds."""
     size = np.ones(len(charts.uvs), np.float32)
     size[charts.frame_faces.ravel()] = np.repeat(scale, 3)
     scaled = replace(charts, uvs=charts.uvs * size[:, None])
@@ -148,16 +170,21 @@ def _pack(charts: LatentMesh, options: xatlas.PackOptions) -> xatlas.Atlas:
     import xatlas
 
     atlas = xatlas.Atlas()
-    atlas.add_uv_mesh(np.ascontiguousarray(charts.uvs), np.ascontiguousarray(charts.frame_faces, np.uint32))
+    atlas.add_uv_mesh(
+        np.ascontiguousarray(charts.uvs), np.ascontiguousarray(charts.frame_faces, np.uint32)
+    )
     atlas.generate(pack_options=options)
     return atlas
 
 
 def charts_of(mesh: LatentMesh) -> NDArray[np.int32]:
-    """(F,) the chart of each face, numbered from 0: faces that share a render vertex lie in one chart."""
+    """(F,) the chart of each face, numbered from 0: faces that share a render vertex lie in one
+    chart."""
     f, n = mesh.frame_faces, len(mesh.uvs)
     start, end = f[:, [0, 1]].ravel(), f[:, [1, 2]].ravel()
-    _, label = connected_components(coo_matrix((np.ones(len(start)), (start, end)), shape=(n, n)), directed=False)
+    _, label = connected_components(
+        coo_matrix((np.ones(len(start)), (start, end)), shape=(n, n)), directed=False
+    )
     return np.unique(label[f[:, 0]], return_inverse=True)[1].astype(np.int32)
 
 
@@ -168,7 +195,9 @@ def uv_areas(mesh: LatentMesh) -> NDArray[np.float64]:
     return np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) / 2
 
 
-def _pack_options(resolution: int, gutter: int, texels: float, tight: bool = False) -> xatlas.PackOptions:
+def _pack_options(
+    resolution: int, gutter: int, texels: float, tight: bool = False
+) -> xatlas.PackOptions:
     """``texels`` per unit of length; 0: about as many as fill the texture."""
     import xatlas
 

@@ -11,18 +11,21 @@ from appearance_opt.initial.edges import touching
 from appearance_opt.initial.stacks import without_copies
 
 MINIMUM_COSINE = -0.6
-"""A collapse may not turn the normal of a face it keeps by more than the angle of this cosine. Thin parts need
-a loose bound: with 0.2 it forbids all cheap collapses there (flight_helmet loses 2 dB)."""
+"""A collapse may not turn the normal of a face it keeps by more than the angle of this cosine. Thin
+parts need a loose bound: with 0.2 it forbids all cheap collapses there (flight_helmet loses 2
+dB)."""
 
 STRICT, TURNING, TEARING = range(3)
-"""What a collapse may do when nothing better is left: turn faces over, then change the topology, too."""
+"""What a collapse may do when nothing better is left: turn faces over, then change the topology,
+too."""
 
 
 @dataclass
 class State:
-    """``positions`` (V, 3); ``quadrics``: (V, 10); ``faces`` (F, 3): live faces only; ``source`` (F,): the face of the
-    input that each comes from; ``single_sided``: by faces of the input; ``blocked``: edges whose
-    collapse is illegal as long as the faces around them do not change; ``part``: see ``parts``."""
+    """``positions`` (V, 3); ``quadrics``: (V, 10); ``faces`` (F, 3): live faces only; ``source``
+    (F,): the face of the input that each comes from; ``single_sided``: by faces of the input;
+    ``blocked``: edges whose collapse is illegal as long as the faces around them do not change;
+    ``part``: see ``parts``."""
 
     positions: NDArray[np.float64]
     quadrics: NDArray[np.float64]
@@ -38,8 +41,8 @@ class State:
 
 
 def legal(state: State, edges: NDArray, target: NDArray, freedom: int) -> NDArray[np.bool_]:
-    """(N,) collapses of ``edges`` (N, 2) to ``target`` (N, 3) that keep the topology and turn no face over, as far as
-    ``freedom`` demands it."""
+    """(N,) collapses of ``edges`` (N, 2) to ``target`` (N, 3) that keep the topology and turn no
+    face over, as far as ``freedom`` demands it."""
     n = len(edges)
     if not n:
         return np.zeros(0, bool)
@@ -58,15 +61,20 @@ def legal(state: State, edges: NDArray, target: NDArray, freedom: int) -> NDArra
     normal = np.cross(before[:, 1] - before[:, 0], before[:, 2] - before[:, 0])
     moved = np.cross(after[:, 1] - after[:, 0], after[:, 2] - after[:, 0])
     sizes = np.linalg.norm(normal, axis=1) * np.linalg.norm(moved, axis=1)
-    turned = np.sum(normal * moved, axis=1) < (MINIMUM_COSINE if freedom == STRICT else -1.1) * sizes
+    turned = (
+        np.sum(normal * moved, axis=1) < (MINIMUM_COSINE if freedom == STRICT else -1.1) * sizes
+    )
     turned |= np.linalg.norm(moved, axis=1) < 1e-14
     out[which[turned]] = False
     return out
 
 
-def _link_condition(faces: NDArray, which: NDArray, inside: NDArray, edges: NDArray) -> NDArray[np.bool_]:
-    """(N,) edges whose ends have no common neighbours but the opposite corners of the edge's faces (Dey et al. 1999).
-    How many faces an edge has does not matter: a wall that stands on a floor, the two sides of a sheet."""
+def _link_condition(
+    faces: NDArray, which: NDArray, inside: NDArray, edges: NDArray
+) -> NDArray[np.bool_]:
+    """(N,) edges whose ends have no common neighbours but the opposite corners of the edge's faces
+    (Dey et al. 1999). How many faces an edge has does not matter: a wall that stands on a floor,
+    the two sides of a sheet."""
     kept = inside == 1
     f, w = faces[kept], which[kept]
     ends = edges[w]
@@ -74,7 +82,8 @@ def _link_condition(faces: NDArray, which: NDArray, inside: NDArray, edges: NDAr
     two = faces[inside == 2]
     own = which[inside == 2]
     third = two[(two != edges[own, :1]) & (two != edges[own, 1:])]
-    # one number per (chosen edge, neighbour, end that has it): twice the same edge and neighbour is a common one
+    # one number per (chosen edge, neighbour, end that has it): twice the same edge and neighbour is
+    # a common one
     n = int(faces.max(initial=0)) + 1
     opposite = np.bincount(np.unique(own * n + third) // n, minlength=len(edges))
     pairs = [2 * (own * n + third) + side for side in (0, 1)]
@@ -91,8 +100,8 @@ def _link_condition(faces: NDArray, which: NDArray, inside: NDArray, edges: NDAr
 
 
 def collapse(state: State, edges: NDArray, target: NDArray, branched: bool) -> None:
-    """Collapse ``edges`` (N, 2), none of which touches a face of another, to ``target`` (N, 3). ``branched``: does any
-    edge have more than two faces? Then faces may come to coincide."""
+    """Collapse ``edges`` (N, 2), none of which touches a face of another, to ``target`` (N, 3).
+    ``branched``: does any edge have more than two faces? Then faces may come to coincide."""
     state.positions[edges[:, 0]] = target
     state.quadrics[edges[:, 0]] += state.quadrics[edges[:, 1]]
     new = np.arange(len(state.positions))
@@ -108,8 +117,12 @@ def collapse(state: State, edges: NDArray, target: NDArray, branched: bool) -> N
     near[state.faces[changed].ravel()] = True
     gone = new[state.blocked >> 32] != state.blocked >> 32
     gone |= new[state.blocked & 0xFFFFFFFF] != state.blocked & 0xFFFFFFFF
-    state.blocked = state.blocked[~(gone | near[state.blocked >> 32] | near[state.blocked & 0xFFFFFFFF])]
+    state.blocked = state.blocked[
+        ~(gone | near[state.blocked >> 32] | near[state.blocked & 0xFFFFFFFF])
+    ]
     if branched:
         here = np.flatnonzero(changed)
-        shown, _ = without_copies(state.faces[here], np.zeros(len(here)), state.single_sided[state.source[here]])
+        shown, _ = without_copies(
+            state.faces[here], np.zeros(len(here)), state.single_sided[state.source[here]]
+        )
         state.keep(np.isin(np.arange(len(state.faces)), here[~shown], invert=True))

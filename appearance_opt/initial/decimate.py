@@ -1,10 +1,10 @@
 """Edge collapse to an exact budget, in rounds of independent collapses.
 
-The metric is Garland and Heckbert's, with faces weighted by area times an importance that the caller
-gives: how much of the face an observer sees. Instead of one collapse at a time, each round collapses all
-cheap edges that are the cheapest of their neighbourhood; their neighbourhoods do not touch, so a round is a
-handful of array operations. Far from the budget, rounds are bolder: see ``BOLD``. What libraries do instead, and
-why it was not enough, is in docs/trials.md: decimation.
+The metric is Garland and Heckbert's, with faces weighted by area times an importance that the
+caller gives: how much of the face an observer sees. Instead of one collapse at a time, each round
+collapses all cheap edges that are the cheapest of their neighbourhood; their neighbourhoods do not
+touch, so a round is a handful of array operations. Far from the budget, rounds are bolder: see
+``BOLD``. What libraries do instead, and why it was not enough, is in docs/trials.md: decimation.
 """
 
 from __future__ import annotations
@@ -29,28 +29,31 @@ BOUNDARY_WEIGHT = 1.0
 """Weight of the planes that hold open boundaries in place, relative to a face of the same size."""
 
 POINT_WEIGHT = 1e-4
-"""Weight of the distance to the original vertices, relative to that of the planes: it keeps triangles well
-shaped where the surface is flat (after Liu, Rahimzadeh and Zordan 2025, line quadrics)."""
+"""Weight of the distance to the original vertices, relative to that of the planes: it keeps
+triangles well shaped where the surface is flat (after Liu, Rahimzadeh and Zordan 2025, line
+quadrics)."""
 
 ROUND_FRACTION, EARLY_FRACTION = 0.12, 0.5
-"""Share of all edges, cheapest first, among which a round chooses. Smaller is closer to one collapse at a
-time, and slower. Early rounds, far from the budget, can be bolder: what they collapse would go anyway."""
+"""Share of all edges, cheapest first, among which a round chooses. Smaller is closer to one
+collapse at a time, and slower. Early rounds, far from the budget, can be bolder: what they collapse
+would go anyway."""
 
 EARLY = 6
 """Rounds are early while there are more than this many times the budget of triangles."""
 
 BOLD, LARGE = 8, 20_000
-"""Rounds are bold while there are more than this many times the budget of triangles, and more than ``LARGE``: smaller
-meshes are quick anyway."""
+"""Rounds are bold while there are more than this many times the budget of triangles, and more than
+``LARGE``: smaller meshes are quick anyway."""
 
 ALIKE = 4.0
-"""In bold rounds, costs within this factor of one another count as equal, and such edges are taken in random order.
-Costs vary smoothly over a fine mesh, so that few edges are the very cheapest around: a round would collapse 1 % of all
-edges, and collapses 4 %."""
+"""In bold rounds, costs within this factor of one another count as equal, and such edges are taken
+in random order. Costs vary smoothly over a fine mesh, so that few edges are the very cheapest
+around: a round would collapse 1 % of all edges, and collapses 4 %."""
 
 BOLD_PASSES = 6
-"""How often a bold round chooses among the edges whose neighbourhoods are still free (Luby 1986). A pass costs a tenth
-of what the costs do. In late rounds it would take expensive edges beside cheap ones: they choose once."""
+"""How often a bold round chooses among the edges whose neighbourhoods are still free (Luby 1986). A
+pass costs a tenth of what the costs do. In late rounds it would take expensive edges beside cheap
+ones: they choose once."""
 
 BLOCK = 1 << 15
 """Edges whose costs are computed at once: their quadrics fit into a core's cache."""
@@ -77,15 +80,17 @@ def decimate_with_source(
 ) -> tuple[NDArray[np.float64], NDArray[np.int32], NDArray[np.int64]]:
     """At most ``triangles`` triangles that look like the given ones.
 
-    ``positions`` (V, 3), ``faces`` (F, 3): any triangle soup; vertices at one place are welded, so that
-    attribute seams are no borders. ``importance`` (F,): non-negative weight of each face, 1 by default.
-    ``single_sided`` (F,): faces that are seen from their front only; none are by default. Faces that lie on
-    others and add nothing to any image go first (see ``stacks``). Parts that would cost more than they show
-    are dropped as a whole. ``told``: called before rounds with the number of triangles that are left.
+    ``positions`` (V, 3), ``faces`` (F, 3): any triangle soup; vertices at one place are welded, so
+    that attribute seams are no borders. ``importance`` (F,): non-negative weight of each face, 1 by
+    default. ``single_sided`` (F,): faces that are seen from their front only; none are by default.
+    Faces that lie on others and add nothing to any image go first (see ``stacks``). Parts that
+    would cost more than they show are dropped as a whole. ``told``: called before rounds with the
+    number of triangles that are left.
 
-    Returns welded positions, faces, and for each of these one of the given faces that it comes from, which has
-    the same sidedness. The count falls short of the budget by one or two at most, unless no legal
-    collapse is left; no faces are returned if no collapse whatever reaches the budget.
+    Returns welded positions, faces, and for each of these one of the given faces that it comes
+    from, which has the same sidedness. The count falls short of the budget by one or two at most,
+    unless no legal collapse is left; no faces are returned if no collapse whatever reaches the
+    budget.
     """
     centre, scale = _centre_and_scale(positions)
     first, place = weld(np.asarray(positions))
@@ -100,7 +105,10 @@ def decimate_with_source(
     state = State(p, vertex_quadrics(p, f, weight, sides, single[source]), f, source, single)
     for freedom in (STRICT, TURNING):
         state.blocked = state.blocked[:0]
-        while len(state.faces) > triangles and (price := _round(state, triangles, freedom)) is not None:
+        while (
+            len(state.faces) > triangles
+            and (price := _round(state, triangles, freedom)) is not None
+        ):
             told(len(state.faces))
             if len(state.faces) <= EARLY * triangles:
                 drop_cheap_parts(state, triangles, price)
@@ -113,13 +121,18 @@ def decimate_with_source(
         state.keep(np.zeros(len(state.faces), bool))
     state.faces, _ = flip_edges(state.positions, state.faces, single[state.source], state.quadrics)
     used, compact = np.unique(state.faces, return_inverse=True)
-    return state.positions[used] * scale + centre, compact.reshape(-1, 3).astype(np.int32), state.source
+    return (
+        state.positions[used] * scale + centre,
+        compact.reshape(-1, 3).astype(np.int32),
+        state.source,
+    )
 
 
 def vertex_quadrics(
     positions: NDArray, faces: NDArray, importance: NDArray, sides: Sides, single_sided: NDArray
 ) -> NDArray:
-    """(V, 10): planes of the faces around each vertex, planes that hold boundaries, original points."""
+    """(V, 10): planes of the faces around each vertex, planes that hold boundaries, original
+    points."""
     p0, p1, p2 = (positions[faces[:, k]] for k in range(3))
     cross = np.cross(p1 - p0, p2 - p0)
     area = 0.5 * np.linalg.norm(cross, axis=1)
@@ -143,13 +156,15 @@ def _add_boundaries(
     sides: Sides,
     single_sided: NDArray,
 ) -> None:
-    """Planes through the edges whose faces all have the same corners (one face, or the two sides of a sheet), and
-    through those between faces that are seen from one side and from both."""
+    """Planes through the edges whose faces all have the same corners (one face, or the two sides of
+    a sheet), and through those between faces that are seen from one side and from both."""
     opposite = faces[:, [2, 0, 1]].ravel()[3 * sides.face + sides.corner]
     alone = np.minimum.reduceat(opposite, sides.start) == np.maximum.reduceat(opposite, sides.start)
     if single_sided.any():
         one_way = single_sided[sides.face]
-        alone |= np.logical_and.reduceat(one_way, sides.start) != np.logical_or.reduceat(one_way, sides.start)
+        alone |= np.logical_and.reduceat(one_way, sides.start) != np.logical_or.reduceat(
+            one_way, sides.start
+        )
     if not alone.any():
         return
     open_ = np.flatnonzero(np.repeat(alone, sides.uses))
@@ -163,8 +178,8 @@ def _add_boundaries(
 
 
 def _round(state: State, triangles: int, freedom: int) -> float | None:
-    """Collapse an independent set of cheap edges. What the dearest of them cost (0 if none was legal); None when there
-    is nothing left to try."""
+    """Collapse an independent set of cheap edges. What the dearest of them cost (0 if none was
+    legal); None when there is nothing left to try."""
     edges, uses = edges_of(state.faces)
     key = keys(edges[:, 0], edges[:, 1])
     if len(state.blocked):
@@ -197,7 +212,8 @@ def _costs(state: State, edges: NDArray) -> tuple[NDArray, NDArray]:
         a, b = edges[here].T
         q = state.quadrics[a] + state.quadrics[b]
         target[here] = quadrics.minimize(q, (state.positions[a] + state.positions[b]) / 2)
-        # between a sum over the surface (which gives small parts away) and a mean (which forgets large ones)
+        # between a sum over the surface (which gives small parts away) and a mean (which forgets
+        # large ones)
         size = np.sqrt(np.maximum(q[:, 0] + q[:, 3] + q[:, 5], 1e-300))
         cost[here] = quadrics.evaluate(q, target[here]) / size
     return target, cost
@@ -215,8 +231,8 @@ def _order(state: State, edges: NDArray, cost: NDArray, bold: bool) -> NDArray:
 
 
 def _independent(state: State, edges: NDArray, rank: NDArray, limit: int, passes: int) -> NDArray:
-    """Edges of rank below ``limit`` that are the best around both of their ends, ``passes`` times over: no other
-    chosen edge touches a vertex of the faces that they change."""
+    """Edges of rank below ``limit`` that are the best around both of their ends, ``passes`` times
+    over: no other chosen edge touches a vertex of the faces that they change."""
     n = len(state.positions)
     faces, left = state.faces, np.flatnonzero(rank < limit)
     chosen = []
@@ -242,7 +258,8 @@ def _independent(state: State, edges: NDArray, rank: NDArray, limit: int, passes
 
 
 def _centre_and_scale(positions: NDArray) -> tuple[NDArray, float]:
-    """Centre and size: collapses are computed in a unit box, so that scale and offset do not matter."""
+    """Centre and size: collapses are computed in a unit box, so that scale and offset do not
+    matter."""
     p = np.asarray(positions, np.float64)
     low, high = p.min(axis=0), p.max(axis=0)
     return (low + high) / 2, max(float((high - low).max()), 1e-300)

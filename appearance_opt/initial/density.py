@@ -1,8 +1,9 @@
 """Texels go where they are seen to be missing.
 
-How much detail a chart holds, how glossy it is and how often it is looked at differ by orders of magnitude between
-the parts of an asset. So the mesh is drawn with its maps and with the same maps at half the resolution; what that
-costs in the image is summed over each chart, and charts that it costs more than others get more texels.
+How much detail a chart holds, how glossy it is and how often it is looked at differ by orders of
+magnitude between the parts of an asset. So the mesh is drawn with its maps and with the same maps
+at half the resolution; what that costs in the image is summed over each chart, and charts that it
+costs more than others get more texels.
 """
 
 from __future__ import annotations
@@ -34,16 +35,20 @@ BATCHES, BATCH, RESOLUTION, SAMPLES = 4, 8, 256, 4
 """Views in which the loss is measured, and how."""
 
 POWER, SMALLEST, LARGEST = 0.25, 0.4, 2.5
-"""Scale of a chart = (loss per texel)^POWER, within bounds. If halving the texels' length quarters the error, the sum
-of all errors is least at this power: errors e s^-2 under a fixed sum of n s^2 ask for s = (e / n)^(1/4)."""
+"""Scale of a chart = (loss per texel)^POWER, within bounds. If halving the texels' length quarters
+the error, the sum of all errors is least at this power: errors e s^-2 under a fixed sum of n s^2
+ask for s = (e / n)^(1/4)."""
 
 UNSEEN = 1e-3
 """Loss per texel that every chart has, relative to the mean: views are few, and miss some."""
 
 
-def chart_scales(mesh: LatentMesh, maps: Mapping[str, NDArray | float], sampler: ViewSampler) -> NDArray[np.float64]:
-    """(F,) how much longer and wider each face's chart should be than it is in the atlas of ``mesh``, relative to the
-    others. ``maps``: (size, size), or a number, by channel name, in natural units; ``sampler``: views and lights."""
+def chart_scales(
+    mesh: LatentMesh, maps: Mapping[str, NDArray | float], sampler: ViewSampler
+) -> NDArray[np.float64]:
+    """(F,) how much longer and wider each face's chart should be than it is in the atlas of
+    ``mesh``, relative to the others. ``maps``: (size, size), or a number, by channel name, in
+    natural units; ``sampler``: views and lights."""
     chart = charts_of(mesh)
     texels = np.bincount(chart, uv_areas(mesh))
     loss = np.bincount(chart, _loss_of_half(mesh, maps, sampler))
@@ -55,8 +60,11 @@ def chart_scales(mesh: LatentMesh, maps: Mapping[str, NDArray | float], sampler:
     return np.clip(scale, SMALLEST, LARGEST)[chart]
 
 
-def _loss_of_half(mesh: LatentMesh, maps: Mapping[str, NDArray | float], sampler: ViewSampler) -> NDArray[np.float64]:
-    """(F,) squared display error that maps at half the resolution make, over the pixels that show each face."""
+def _loss_of_half(
+    mesh: LatentMesh, maps: Mapping[str, NDArray | float], sampler: ViewSampler
+) -> NDArray[np.float64]:
+    """(F,) squared display error that maps at half the resolution make, over the pixels that show
+    each face."""
     topology = LatentTopology(mesh, tangents="normal_x" in maps)
     scene = topology.scene()
     surface = topology.surface(mi.Float(np.ascontiguousarray(mesh.positions, np.float32).ravel()))
@@ -68,14 +76,23 @@ def _loss_of_half(mesh: LatentMesh, maps: Mapping[str, NDArray | float], sampler
         records = sampler.draw(k, BATCH).records()
         fine, coarse = (display(_image(scene, surface, m, records, grid)) for m in both)
         error = np.mean((fine - coarse) ** 2, axis=-1).ravel()
-        hits = rays.trace(scene, records, grid.view, mi.Float(grid.column) + 0.5, mi.Float(grid.row) + 0.5, grid.size)
+        hits = rays.trace(
+            scene,
+            records,
+            grid.view,
+            mi.Float(grid.column) + 0.5,
+            mi.Float(grid.row) + 0.5,
+            grid.size,
+        )
         face = np.array(hits.triangle)
         seen = face != rays.MISS
         out += np.bincount(face[seen], error[pixel[seen]], len(out))
     return out
 
 
-def _image(scene, surface, maps: MaterialMaps, records: mi.Float, grid: Grid) -> NDArray[np.float32]:
+def _image(
+    scene, surface, maps: MaterialMaps, records: mi.Float, grid: Grid
+) -> NDArray[np.float32]:
     with dr.suspend_grad():
         image = render_image(scene, surface, maps, records, grid, SAMPLES)
     return np.array(image).reshape(grid.views, grid.resolution, grid.resolution, 4)
@@ -86,7 +103,9 @@ def halve(image: NDArray[np.float32]) -> NDArray[np.float32]:
     h, w = image.shape
     half = image.reshape(h // 2, 2, w // 2, 2).mean(axis=(1, 3))
     for axis in (0, 1):
-        x = np.moveaxis(np.pad(half, [(1, 1) if k == axis else (0, 0) for k in (0, 1)], mode="edge"), axis, 0)
+        x = np.moveaxis(
+            np.pad(half, [(1, 1) if k == axis else (0, 0) for k in (0, 1)], mode="edge"), axis, 0
+        )
         pair = np.stack([0.75 * x[1:-1] + 0.25 * x[:-2], 0.75 * x[1:-1] + 0.25 * x[2:]], axis=1)
         half = np.moveaxis(pair.reshape(-1, x.shape[1]), 0, axis)
     return half.astype(np.float32)

@@ -29,7 +29,11 @@ class Sides:
     def corners(self, faces: NDArray) -> tuple[NDArray, NDArray, NDArray]:
         """(first, last, opposite) vertex of each side."""
         side = 3 * self.face + self.corner
-        return faces.ravel()[side], faces[:, [1, 2, 0]].ravel()[side], faces[:, [2, 0, 1]].ravel()[side]
+        return (
+            faces.ravel()[side],
+            faces[:, [1, 2, 0]].ravel()[side],
+            faces[:, [2, 0, 1]].ravel()[side],
+        )
 
 
 def sides_of(faces: NDArray) -> Sides:

@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 
 def fill(values: NDArray[np.float32], known: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """Pull and push (Gortler et al. 1996): unknown texels of (H, W, C) take the average of the nearest
-    known ones, smoothly. Known texels stay as they are; with none known, all stay."""
+    """Pull and push (Gortler et al. 1996): unknown texels of (H, W, C) take the average of the
+    nearest known ones, smoothly. Known texels stay as they are; with none known, all stay."""
     if known.all() or not known.any():
         return values
     levels = [(values * known[..., None], known.astype(np.float32))]

@@ -1,4 +1,5 @@
-"""Flat regions end without slivers: edges are flipped where the surface stays and the triangles get better."""
+"""Flat regions end without slivers: edges are flipped where the surface stays and the triangles get
+better."""
 
 from __future__ import annotations
 
@@ -10,28 +11,30 @@ from appearance_opt.initial import quadrics
 from appearance_opt.initial.edges import keys, sides_of, touching
 
 FLAT = 0.002
-"""How far apart the two diagonals of four corners may lie for their edge to be flipped, in units of the square root of
-the area between them. With 0.02 flight_helmet's start at 1.5 % lost 1 dB: in long thin faces that is as much as they
-are wide."""
+"""How far apart the two diagonals of four corners may lie for their edge to be flipped, in units of
+the square root of the area between them. With 0.02 flight_helmet's start at 1.5 % lost 1 dB: in
+long thin faces that is as much as they are wide."""
 
 THIN = 0.5
-"""How far apart they may lie where the new one is no farther from the original surface, in units of the least height of
-the four triangles. Without this bound, and with errors that may grow by the price of a collapse, chess_king's start at
+"""How far apart they may lie where the new one is no farther from the original surface, in units of
+the least height of the four triangles. Without this bound, and with errors that may grow by the
+price of a collapse, chess_king's start at
 1.5 % loses 0.3 dB; docs/trials.md: decimation."""
 
 POOR = 0.3
 """Quality below which a triangle is to be made better: others stay as the decimation chose them."""
 
 GAIN = 1.1
-"""How many times better the worse of the two triangles must get: from fans to strips it takes many small steps."""
+"""How many times better the worse of the two triangles must get: from fans to strips it takes many
+small steps."""
 
 ROUNDS = 30
 """At most. Each flip makes the worse triangle of two better; measured: 3 to 12 rounds."""
 
 
 def quality(a: NDArray, b: NDArray, c: NDArray) -> NDArray[np.float64]:
-    """(N,) 4 sqrt(3) area over the sum of the squared sides of triangles with corners (N, 3): 1 if equilateral, 0 if
-    its corners lie on a line (Bank and Smith 1997)."""
+    """(N,) 4 sqrt(3) area over the sum of the squared sides of triangles with corners (N, 3): 1 if
+    equilateral, 0 if its corners lie on a line (Bank and Smith 1997)."""
     area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=-1)
     squared = sum(np.sum((u - v) ** 2, axis=-1) for u, v in ((a, b), (b, c), (c, a)))
     return 4 * 3**0.5 * area / np.maximum(squared, 1e-300)
@@ -40,11 +43,13 @@ def quality(a: NDArray, b: NDArray, c: NDArray) -> NDArray[np.float64]:
 def flip_edges(
     positions: NDArray, faces: NDArray, kind: NDArray, point_quadrics: NDArray
 ) -> tuple[NDArray[np.int64], int]:
-    """(faces (F, 3), flips): nearly the same surface (see ``FLAT``), or one that lies nearer to the original by the
-    quadrics of its vertices (V, 10) (see ``THIN``), with fewer triangles below ``POOR``.
+    """(faces (F, 3), flips): nearly the same surface (see ``FLAT``), or one that lies nearer to the
+    original by the quadrics of its vertices (V, 10) (see ``THIN``), with fewer triangles below
+    ``POOR``.
 
-    Only edges of two faces of equal ``kind`` (F,) are flipped, and only to where no edge is: borders, creases and edges
-    of more than two faces stay. A face keeps the index of one of the two that it came from.
+    Only edges of two faces of equal ``kind`` (F,) are flipped, and only to where no edge is:
+    borders, creases and edges of more than two faces stay. A face keeps the index of one of the two
+    that it came from.
     """
     faces, total = faces.astype(np.int64), 0
     around = faces[quality(*(positions[faces[:, k]] for k in range(3))) < POOR].ravel()
@@ -65,8 +70,8 @@ def flip_edges(
 def _flip_best(
     positions: NDArray, faces: NDArray, kind: NDArray, point_quadrics: NDArray, marked: NDArray
 ) -> tuple[int, NDArray]:
-    """Flip the best edges around, of those at ``marked`` vertices; ``faces`` are changed. (How many there were,
-    vertices around which there may be more)."""
+    """Flip the best edges around, of those at ``marked`` vertices; ``faces`` are changed. (How many
+    there were, vertices around which there may be more)."""
     sides = sides_of(faces)
     first, last, opposite = sides.corners(faces)
     known = keys(first[sides.start], last[sides.start])
@@ -79,7 +84,13 @@ def _flip_best(
     new = keys(c, d)
     allowed = (c != d) & (marked[a] | marked[b]) & (marked[c] | marked[d]) & ~np.isin(new, known)
     a, b, c, d, f, g, new = (x[allowed] for x in (a, b, c, d, f, g, new))
-    gain = _gain(positions[a], positions[b], positions[c], positions[d], sum(point_quadrics[x] for x in (a, b, c, d)))
+    gain = _gain(
+        positions[a],
+        positions[b],
+        positions[c],
+        positions[d],
+        sum(point_quadrics[x] for x in (a, b, c, d)),
+    )
     wanted = np.flatnonzero(gain > GAIN)
     # each face takes part in one flip, each new edge comes from one
     wanted = wanted[np.argsort(-gain[wanted], kind="stable")]
@@ -94,15 +105,17 @@ def _flip_best(
 
 
 def _gain(a: NDArray, b: NDArray, c: NDArray, d: NDArray, q: NDArray) -> NDArray[np.float64]:
-    """(N,) how many times better the worse of two triangles gets if (a, b, c) and (b, a, d) become (a, d, c) and
-    (d, b, c); 0 if that moved the surface away from the original, by the quadrics ``q`` (N, 10) of all four corners,
-    or turned a triangle over."""
+    """(N,) how many times better the worse of two triangles gets if (a, b, c) and (b, a, d) become
+    (a, d, c) and (d, b, c); 0 if that moved the surface away from the original, by the quadrics
+    ``q`` (N, 10) of all four corners, or turned a triangle over."""
     crosses = np.cross(b - a, c - a), np.cross(a - b, d - b)
     size = np.linalg.norm(crosses[0] + crosses[1], axis=1)
     middle = unit(crosses[0] + crosses[1])
     on_old, on_new = _nearest(a, b, c, d)
     apart = np.linalg.norm(on_new - on_old, axis=1)
-    height = np.minimum.reduce([_height(x, y, z) for x, y, z in ((a, b, c), (b, a, d), (a, d, c), (d, b, c))])
+    height = np.minimum.reduce(
+        [_height(x, y, z) for x, y, z in ((a, b, c), (b, a, d), (a, d, c), (d, b, c))]
+    )
     flat = apart <= FLAT * np.sqrt(size / 2)
     near = (apart <= THIN * height) & (quadrics.evaluate(q, on_new) <= quadrics.evaluate(q, on_old))
     widest = np.minimum(*(np.sum(unit(cross) * middle, axis=1) for cross in crosses))
@@ -111,7 +124,9 @@ def _gain(a: NDArray, b: NDArray, c: NDArray, d: NDArray, q: NDArray) -> NDArray
         flat &= cosine > 0.5
         near &= (cosine > 0.5) & (cosine >= widest)
     before = np.minimum(quality(a, b, c), quality(b, a, d))
-    return np.where(flat | near, np.minimum(quality(a, d, c), quality(d, b, c)) / np.maximum(before, 1e-12), 0.0)
+    return np.where(
+        flat | near, np.minimum(quality(a, d, c), quality(d, b, c)) / np.maximum(before, 1e-12), 0.0
+    )
 
 
 def _height(a: NDArray, b: NDArray, c: NDArray) -> NDArray[np.float64]:
@@ -121,10 +136,12 @@ def _height(a: NDArray, b: NDArray, c: NDArray) -> NDArray[np.float64]:
 
 
 def _nearest(a: NDArray, b: NDArray, c: NDArray, d: NDArray) -> tuple[NDArray, NDArray]:
-    """((N, 3) on the lines from a to b, (N, 3) on those from c to d): where they are nearest to one another, within
-    the ends."""
+    """((N, 3) on the lines from a to b, (N, 3) on those from c to d): where they are nearest to one
+    another, within the ends."""
     u, v, w = b - a, d - c, c - a
-    uu, vv, uv, uw, vw = (np.sum(x * y, axis=1) for x, y in ((u, u), (v, v), (u, v), (u, w), (v, w)))
+    uu, vv, uv, uw, vw = (
+        np.sum(x * y, axis=1) for x, y in ((u, u), (v, v), (u, v), (u, w), (v, w))
+    )
     determinant = np.maximum(uu * vv - uv * uv, 1e-300)
     s = np.clip((uw * vv - vw * uv) / determinant, 0, 1)
     t = np.clip((uv * uw - uu * vw) / determinant, 0, 1)

@@ -10,12 +10,14 @@ from scipy.sparse.csgraph import connected_components
 from appearance_opt.initial.collapse import State
 
 LOST = 0.03
-"""What it costs to drop a connected part, in units of its weight times its diameter squared: as if its surface moved by
-a sixth of its diameter. Between 0.01 and 0.1 flight_helmet's start changes by less than a decibel."""
+"""What it costs to drop a connected part, in units of its weight times its diameter squared: as if
+its surface moved by a sixth of its diameter. Between 0.01 and 0.1 flight_helmet's start changes by
+less than a decibel."""
 
 
 def parts(state: State) -> NDArray:
-    """(V,) the connected part that each vertex belongs to. Found once: collapses neither join parts nor split them."""
+    """(V,) the connected part that each vertex belongs to. Found once: collapses neither join parts
+    nor split them."""
     if state.part is None:
         n, f = len(state.positions), state.faces
         ends = f[:, [0, 1]].ravel(), f[:, [1, 2]].ravel()
@@ -25,8 +27,9 @@ def parts(state: State) -> NDArray:
 
 
 def drop_cheap_parts(state: State, triangles: int, price: float) -> None:
-    """Remove connected parts whose loss costs less than their triangles are worth elsewhere: ``price`` for every two.
-    No part collapses to nothing, so that many small ones would take what the large ones need."""
+    """Remove connected parts whose loss costs less than their triangles are worth elsewhere:
+    ``price`` for every two. No part collapses to nothing, so that many small ones would take what
+    the large ones need."""
     part = parts(state)
     of_face = part[state.faces[:, 0]]
     count = np.bincount(of_face)
@@ -52,7 +55,8 @@ def drop_cheap_parts(state: State, triangles: int, price: float) -> None:
 
 
 def drop_smallest_parts(state: State, triangles: int) -> None:
-    """Remove whole connected parts, the smallest first, until the budget is met or the largest is left."""
+    """Remove whole connected parts, the smallest first, until the budget is met or the largest is
+    left."""
     f = state.faces
     of_face = parts(state)[f[:, 0]]
     p = state.positions[f]

@@ -14,7 +14,8 @@ _UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
 
 def of_planes(normals: NDArray, points: NDArray, weights: NDArray) -> NDArray:
-    """Weighted squared distance to planes with unit ``normals`` (N, 3) through ``points``: (N, 10)."""
+    """Weighted squared distance to planes with unit ``normals`` (N, 3) through ``points``: (N,
+    10)."""
     offset = -np.sum(normals * points, axis=1)
     out = np.empty((len(normals), SIZE))
     for k, (i, j) in enumerate(_UPPER):
@@ -39,7 +40,8 @@ def evaluate(q: NDArray, x: NDArray) -> NDArray:
         q[:, 0] * x[:, 0] ** 2
         + q[:, 3] * x[:, 1] ** 2
         + q[:, 5] * x[:, 2] ** 2
-        + 2 * (q[:, 1] * x[:, 0] * x[:, 1] + q[:, 2] * x[:, 0] * x[:, 2] + q[:, 4] * x[:, 1] * x[:, 2])
+        + 2
+        * (q[:, 1] * x[:, 0] * x[:, 1] + q[:, 2] * x[:, 0] * x[:, 2] + q[:, 4] * x[:, 1] * x[:, 2])
     )
     return np.maximum(a + 2 * np.sum(q[:, 6:9] * x, axis=1) + q[:, 9], 0.0)
 
@@ -48,7 +50,14 @@ def minimize(q: NDArray, toward: NDArray, pull: float = 1e-3) -> NDArray:
     """Points (N, 3) of least value. Where a quadric leaves a direction free (flat or straight
     neighbourhoods) the point nearest to ``toward`` is taken: a pull of ``pull`` times A's trace."""
     weight = pull * (q[:, 0] + q[:, 3] + q[:, 5]) + 1e-300
-    xx, xy, xz, yy, yz, zz = q[:, 0] + weight, q[:, 1], q[:, 2], q[:, 3] + weight, q[:, 4], q[:, 5] + weight
+    xx, xy, xz, yy, yz, zz = (
+        q[:, 0] + weight,
+        q[:, 1],
+        q[:, 2],
+        q[:, 3] + weight,
+        q[:, 4],
+        q[:, 5] + weight,
+    )
     r = weight[:, None] * toward - q[:, 6:9]
     # Cramer's rule with the symmetric adjugate
     c00, c01, c02 = yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy

@@ -1,9 +1,10 @@
 """Triangles go to where the image error is.
 
-The quadric metric knows distances, not appearance: whether a flattened bump is seen depends on contrast, on
-texture and on the directions it is seen from. So the decimated mesh is drawn beside the reference, the error of
-the pixels is collected on the faces of the reference, and the reference is decimated once more with the
-faces weighted by it. One round gains 0.3 to 0.5 dB at the same count; the best start of all rounds is kept.
+The quadric metric knows distances, not appearance: whether a flattened bump is seen depends on
+contrast, on texture and on the directions it is seen from. So the decimated mesh is drawn beside
+the reference, the error of the pixels is collected on the faces of the reference, and the reference
+is decimated once more with the faces weighted by it. One round gains 0.3 to 0.5 dB at the same
+count; the best start of all rounds is kept.
 """
 
 from __future__ import annotations
@@ -36,38 +37,50 @@ VIEWS, BATCH, RESOLUTION, SAMPLES = 64, 8, 256, 4
 """Views in which the error is measured, and how."""
 
 RINGS = 6
-"""Rings of faces over which the error is averaged: about the size of a new triangle. Without it the noise of
-single pixels would be taken for detail."""
+"""Rings of faces over which the error is averaged: about the size of a new triangle. Without it the
+noise of single pixels would be taken for detail."""
 
 FIXED_POINT = 2.0**32
 """Errors are added up as integers: threads may add them in any order without changing the start."""
 
 POWER, LOWEST, HIGHEST = 0.35, 0.3, 3.0
-"""Weight = (error over its median)^POWER within bounds. Larger powers overshoot (0.6 loses what 0.35 gains)."""
+"""Weight = (error over its median)^POWER within bounds. Larger powers overshoot (0.6 loses what
+0.35 gains)."""
 
 
 class StartError:
-    """How far a start looks from the reference, over views that neither the fit nor its validation uses."""
+    """How far a start looks from the reference, over views that neither the fit nor its validation
+    uses."""
 
     def __init__(self, reference: MeshReference, sampler: ViewSampler, views: int = VIEWS) -> None:
         self.reference = reference
         self._grid = Grid(BATCH, RESOLUTION)
         self._records = [sampler.draw(k, BATCH).records() for k in range(views // BATCH)]
-        self._images = [self._display(reference.render_device(r, self._grid, SAMPLES)) for r in self._records]
+        self._images = [
+            self._display(reference.render_device(r, self._grid, SAMPLES)) for r in self._records
+        ]
 
-    def measure(self, mesh: LatentMesh, maps: Mapping[str, NDArray | float]) -> tuple[float, NDArray[np.float64]]:
-        """(mean squared display error, its sum over the pixels that show each face of the reference (F,))."""
+    def measure(
+        self, mesh: LatentMesh, maps: Mapping[str, NDArray | float]
+    ) -> tuple[float, NDArray[np.float64]]:
+        """(mean squared display error, its sum over the pixels that show each face of the reference
+        (F,))."""
         total = dr.zeros(mi.UInt64, len(self.reference.merged.faces))
         topology = LatentTopology(mesh, tangents=True)
         scene = topology.scene()
         layers = maps_of(maps)
-        surface = topology.surface(mi.Float(np.ascontiguousarray(mesh.positions, np.float32).ravel()))
+        surface = topology.surface(
+            mi.Float(np.ascontiguousarray(mesh.positions, np.float32).ravel())
+        )
         mean = 0.0
         for records, expected in zip(self._records, self._images, strict=True):
-            image = self._display(render_image(scene, surface, layers, records, self._grid, SAMPLES))
+            image = self._display(
+                render_image(scene, surface, layers, records, self._grid, SAMPLES)
+            )
             error = np.mean((image - expected) ** 2, axis=-1)
             mean += float(error.mean()) / len(self._records)
-            # a pixel's neighbours answer for it, too: beside an outline the reference shows nothing to blame
+            # a pixel's neighbours answer for it, too: beside an outline the reference shows nothing
+            # to blame
             spread = maximum_filter(error, size=(1, 3, 3))
             self._collect(total, records, mi.Float(spread.ravel()))
         return mean, np.array(total).astype(np.float64) / FIXED_POINT
@@ -75,7 +88,12 @@ class StartError:
     def _collect(self, total: mi.UInt64, records: mi.Float, error: mi.Float) -> None:
         g = self._grid
         hits = rays.trace(
-            self.reference.scene, records, g.view, mi.Float(g.column) + 0.5, mi.Float(g.row) + 0.5, g.size
+            self.reference.scene,
+            records,
+            g.view,
+            mi.Float(g.column) + 0.5,
+            mi.Float(g.row) + 0.5,
+            g.size,
         )
         seen = hits.triangle != rays.MISS
         pixel = (g.view * g.rows + g.row) * g.rows + g.column
@@ -87,9 +105,11 @@ class StartError:
         return display(np.array(image).reshape(BATCH, RESOLUTION, RESOLUTION, 4))
 
 
-def weights(positions: NDArray, faces: NDArray, error: NDArray, visible: NDArray) -> NDArray[np.float64]:
-    """(F,) factors for the importance of faces from the image error collected on each: error per area, averaged
-    over ``RINGS`` rings, relative to the median of the visible faces."""
+def weights(
+    positions: NDArray, faces: NDArray, error: NDArray, visible: NDArray
+) -> NDArray[np.float64]:
+    """(F,) factors for the importance of faces from the image error collected on each: error per
+    area, averaged over ``RINGS`` rings, relative to the median of the visible faces."""
     f, area, vertices = welded_areas(positions, faces)
     for _ in range(RINGS):
         error, area = (around(x, f, vertices)[f].mean(axis=1) / 6 for x in (error, area))

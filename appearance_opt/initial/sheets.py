@@ -1,7 +1,7 @@
 """Sheets that lie back to back, each seen from its own side only: leaves, pages, signs.
 
-Welded, their two sides share every vertex: the normals of both cancel there, and a chart of the atlas could run from
-one side over the rim onto the other. So each side gets vertices of its own.
+Welded, their two sides share every vertex: the normals of both cancel there, and a chart of the
+atlas could run from one side over the rim onto the other. So each side gets vertices of its own.
 """
 
 from __future__ import annotations
@@ -24,8 +24,9 @@ FOLDED = -0.95
 
 @dataclass(frozen=True)
 class Separated:
-    """``positions`` (V, 3) and ``faces`` (F, 3): of a mesh whose sheets share no vertex with what is at their backs;
-    ``behind`` (F,): faces of such sheets of which those at their backs are none."""
+    """``positions`` (V, 3) and ``faces`` (F, 3): of a mesh whose sheets share no vertex with what
+    is at their backs; ``behind`` (F,): faces of such sheets of which those at their backs are
+    none."""
 
     positions: NDArray
     faces: NDArray
@@ -33,8 +34,9 @@ class Separated:
 
 
 def separate(positions: NDArray, faces: NDArray, single: NDArray[np.bool_] | None) -> Separated:
-    """A welded mesh with a vertex more wherever faces that are seen from one side only (``single`` (F,), None for none)
-    meet others that look the opposite way, without an edge that leads from the ones to the others."""
+    """A welded mesh with a vertex more wherever faces that are seen from one side only (``single``
+    (F,), None for none) meet others that look the opposite way, without an edge that leads from the
+    ones to the others."""
     one_way, nothing = culled(positions, faces, single), np.zeros(len(faces), bool)
     if one_way is None:
         return Separated(positions, faces, nothing)
@@ -61,11 +63,16 @@ def separate(positions: NDArray, faces: NDArray, single: NDArray[np.bool_] | Non
     out[away] = len(positions) + number.ravel()
     # which of two sides is taken out does not matter, as long as it is never both
     second = one_way & split[faces].any(axis=1) & (normals @ np.array(ACROSS) < 0)
-    return Separated(np.concatenate([positions, positions[copied]]), out.reshape(-1, 3).astype(faces.dtype), second)
+    return Separated(
+        np.concatenate([positions, positions[copied]]),
+        out.reshape(-1, 3).astype(faces.dtype),
+        second,
+    )
 
 
 def _fans(faces: NDArray, normals: NDArray, one_way: NDArray) -> NDArray[np.int32]:
-    """(3 F,) fan of each corner: faces around a vertex from each of which edges lead to the next, over no fold."""
+    """(3 F,) fan of each corner: faces around a vertex from each of which edges lead to the next,
+    over no fold."""
     s: Sides = sides_of(faces.astype(np.int64))
     first, _, _ = s.corners(faces)
     edge = np.repeat(np.arange(len(s.start)), s.uses)
@@ -74,10 +81,21 @@ def _fans(faces: NDArray, normals: NDArray, one_way: NDArray) -> NDArray[np.int3
         a = np.flatnonzero(edge[:-step] == edge[step:])
         b = a + step
         f, g = s.face[a], s.face[b]
-        on = (first[a] != first[b]) & (np.sum(normals[f] * normals[g], axis=1) > FOLDED) & one_way[f] & one_way[g]
+        on = (
+            (first[a] != first[b])
+            & (np.sum(normals[f] * normals[g], axis=1) > FOLDED)
+            & one_way[f]
+            & one_way[g]
+        )
         a, b = a[on], b[on]
-        ends = [(3 * s.face[k] + s.corner[k], 3 * s.face[k] + (s.corner[k] + 1) % 3) for k in (a, b)]
+        ends = [
+            (3 * s.face[k] + s.corner[k], 3 * s.face[k] + (s.corner[k] + 1) % 3) for k in (a, b)
+        ]
         joined += [(ends[0][0], ends[1][1]), (ends[0][1], ends[1][0])]
-    rows, columns = (np.concatenate([j[k] for j in joined]) if joined else np.empty(0, np.int64) for k in (0, 1))
+    rows, columns = (
+        np.concatenate([j[k] for j in joined]) if joined else np.empty(0, np.int64) for k in (0, 1)
+    )
     size = 3 * len(faces)
-    return connected_components(coo_matrix((np.ones(len(rows)), (rows, columns)), (size, size)), directed=False)[1]
+    return connected_components(
+        coo_matrix((np.ones(len(rows)), (rows, columns)), (size, size)), directed=False
+    )[1]

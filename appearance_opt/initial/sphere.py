@@ -12,9 +12,11 @@ SMALLEST = 12
 """Triangles of the coarsest sphere, a cube."""
 
 
-def sphere(triangles: int, centre: tuple[float, float, float], radius: float, size: int) -> LatentMesh:
-    """A sphere of at most ``triangles`` triangles, evenly spread: a cube-sphere of six n x n grids, 12 n^2
-    triangles, with an atlas for ``size`` texels."""
+def sphere(
+    triangles: int, centre: tuple[float, float, float], radius: float, size: int
+) -> LatentMesh:
+    """A sphere of at most ``triangles`` triangles, evenly spread: a cube-sphere of six n x n grids,
+    12 n^2 triangles, with an atlas for ``size`` texels."""
     n = max(1, int(np.sqrt(triangles / 12)))
     positions, faces = _cube(n)
     positions /= np.linalg.norm(positions, axis=1, keepdims=True)

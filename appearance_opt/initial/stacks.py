@@ -1,8 +1,8 @@
 """Faces that lie on others and add nothing to any image.
 
-Booleans and careless modelling leave them: a face twice, a flap of two triangles over the same three
-corners, a fin that hangs on an edge of a flat face and lies in its plane. They would take a part of
-the budget, and every one of them fights with what it lies on for the same pixels.
+Booleans and careless modelling leave them: a face twice, a flap of two triangles over the same
+three corners, a fin that hangs on an edge of a flat face and lies in its plane. They would take a
+part of the budget, and every one of them fights with what it lies on for the same pixels.
 
 What is seen of a face are its sides: both of a double-sided one, the one that it faces of a
 single-sided one. A face goes when each side that it shows is shown by others at the same place. Of
@@ -21,15 +21,16 @@ from appearance_opt.asset.normals import unit
 from appearance_opt.initial.edges import Sides, sides_of
 
 TOLERANCE = 1e-5
-"""How far from another face a point of a covered one may lie, in units of the mesh's box: positions in
-single precision are exact to a hundredth of that."""
+"""How far from another face a point of a covered one may lie, in units of the mesh's box: positions
+in single precision are exact to a hundredth of that."""
 
 ANGLE, SEAM = 0.03, 0.3
-"""Radians between faces at an edge up to which one lies on the other, and where their turns are counted from."""
+"""Radians between faces at an edge up to which one lies on the other, and where their turns are
+counted from."""
 
 STEPS, CHOICES = 64, 32
-"""Faces that a walk to a point may cross, and faces that it may choose from at an edge: beyond that the point counts as
-not covered."""
+"""Faces that a walk to a point may cross, and faces that it may choose from at an edge: beyond that
+the point counts as not covered."""
 
 LATTICE = 4
 """Points of a face that must be covered: a triangular lattice with this many intervals per side."""
@@ -38,9 +39,10 @@ LATTICE = 4
 def without_stacks(
     positions: NDArray, faces: NDArray, weight: NDArray, single_sided: NDArray[np.bool_]
 ) -> tuple[NDArray[np.int64], NDArray, Sides]:
-    """(indices of the faces that add something (N,), their weights, their sides). ``positions`` (V, 3) of welded
-    vertices in a unit box; ``faces`` (F, 3); ``weight`` (F,): a face that stays has the largest one of
-    those that coincide with it; ``single_sided`` (F,): faces that are seen from their front only."""
+    """(indices of the faces that add something (N,), their weights, their sides). ``positions`` (V,
+    3) of welded vertices in a unit box; ``faces`` (F, 3); ``weight`` (F,): a face that stays has
+    the largest one of those that coincide with it; ``single_sided`` (F,): faces that are seen from
+    their front only."""
     shown, weight = without_copies(faces, weight, single_sided)
     kept = np.flatnonzero(shown)
     while True:
@@ -54,7 +56,8 @@ def without_stacks(
 def without_copies(
     faces: NDArray, weight: NDArray, single_sided: NDArray[np.bool_]
 ) -> tuple[NDArray[np.bool_], NDArray]:
-    """((F,) faces but for those whose sides others over the same corners show; weights). See ``without_stacks``."""
+    """((F,) faces but for those whose sides others over the same corners show; weights). See
+    ``without_stacks``."""
     shown = np.ones(len(faces), bool)
     members, place = coincident(faces)
     if len(members):
@@ -67,12 +70,14 @@ def without_copies(
 
 
 def coincident(faces: NDArray) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """(faces that share all three corners with another one (N,), in order; place of each, numbered from 0)."""
+    """(faces that share all three corners with another one (N,), in order; place of each, numbered
+    from 0)."""
     corners = np.sort(faces, axis=1)
     hashed = _hash(corners)
     ordered = np.sort(hashed)
     twice = ordered[1:][ordered[1:] == ordered[:-1]]
-    # few faces, if any, are looked at closely: sorting triples takes ten times as long as sorting numbers
+    # few faces, if any, are looked at closely: sorting triples takes ten times as long as sorting
+    # numbers
     members = np.flatnonzero(np.isin(hashed, twice)) if len(twice) else np.empty(0, np.int64)
     if not len(members):
         return members, members
@@ -84,7 +89,9 @@ def coincident(faces: NDArray) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
 
 def _hash(corners: NDArray) -> NDArray[np.uint64]:
     a, b, c = corners.astype(np.uint64).T
-    mixed = a * np.uint64(0x9E3779B97F4A7C15) ^ (b * np.uint64(0xC2B2AE3D27D4EB4F) + c * np.uint64(0x165667B19E3779F9))
+    mixed = a * np.uint64(0x9E3779B97F4A7C15) ^ (
+        b * np.uint64(0xC2B2AE3D27D4EB4F) + c * np.uint64(0x165667B19E3779F9)
+    )
     return mixed ^ (mixed >> np.uint64(29))
 
 
@@ -107,13 +114,15 @@ def _is_odd(faces: NDArray) -> NDArray[np.int64]:
     return ((a > b) ^ (b > c) ^ (a > c)).astype(np.int64)
 
 
-def _covered(positions: NDArray, faces: NDArray, sides: Sides, single_sided: NDArray) -> NDArray[np.bool_]:
+def _covered(
+    positions: NDArray, faces: NDArray, sides: Sides, single_sided: NDArray
+) -> NDArray[np.bool_]:
     """(F,) faces that lie on others, of patches that hang on an edge of more than two faces.
 
-    Patches are faces that are connected across edges of two. From the face that a patch lies on at such an edge,
-    walks lead over the surface to points all over the patch. A face is covered if each walk to its points ends
-    on a face that has the point and shows the same sides. Of faces that cover each other those of the largest
-    patch stay.
+    Patches are faces that are connected across edges of two. From the face that a patch lies on at
+    such an edge, walks lead over the surface to points all over the patch. A face is covered if
+    each walk to its points ends on a face that has the point and shows the same sides. Of faces
+    that cover each other those of the largest patch stay.
     """
     gone = np.zeros(len(faces), bool)
     if not (sides.uses > 2).any():
@@ -148,13 +157,21 @@ def _patches(sides: Sides, count: int) -> NDArray[np.int32]:
     """(F,) patch of each face: faces are connected across edges of two."""
     at = sides.start[sides.uses == 2]
     a, b = sides.face[at], sides.face[at + 1]
-    return connected_components(coo_matrix((np.ones(len(a)), (a, b)), (count, count)), directed=False)[1]
+    return connected_components(
+        coo_matrix((np.ones(len(a)), (a, b)), (count, count)), directed=False
+    )[1]
 
 
 def _grounds(
-    sides: Sides, faces: NDArray, positions: NDArray, normals: NDArray, patch: NDArray, area: NDArray
+    sides: Sides,
+    faces: NDArray,
+    positions: NDArray,
+    normals: NDArray,
+    patch: NDArray,
+    area: NDArray,
 ) -> NDArray[np.int64]:
-    """(patches,) a face of a larger patch that a patch lies on at one of its edges; -1 where there is none."""
+    """(patches,) a face of a larger patch that a patch lies on at one of its edges; -1 where there
+    is none."""
     first, last, _ = sides.corners(faces)
     many = np.flatnonzero(np.repeat(sides.uses, sides.uses) > 2)
     face = sides.face[many]
@@ -173,13 +190,14 @@ def _grounds(
 
 
 def _same_way(edge: NDArray, along: NDArray, inward: NDArray) -> NDArray[np.int64]:
-    """(N,) group of each side, from 0: sides of one ``edge`` (N,) that lead the same way from it. ``along`` (N, 3): the
-    edge; ``inward`` (N, 3): where the side's face lies."""
+    """(N,) group of each side, from 0: sides of one ``edge`` (N,) that lead the same way from it.
+    ``along`` (N, 3): the edge; ``inward`` (N, 3): where the side's face lies."""
     begins = np.zeros(int(edge.max()) + 1, np.int64)
     begins[edge[::-1]] = np.arange(len(edge))[::-1]
     reference = inward[begins[edge]]
     sine = np.sum(np.cross(reference, inward) * unit(along), axis=1)
-    # turns are counted from a little before the first face: what lies in its plane must not be cut at half a turn
+    # turns are counted from a little before the first face: what lies in its plane must not be cut
+    # at half a turn
     turn = np.mod(np.arctan2(sine, np.sum(reference * inward, axis=1)) + SEAM, 2 * np.pi)
     order = np.lexsort((turn, edge))
     new = np.concatenate([[False], (np.diff(edge[order]) > 0) | (np.diff(turn[order]) > ANGLE)])
@@ -195,16 +213,19 @@ def _inward(corners: NDArray, normals: NDArray, face: NDArray, corner: NDArray) 
 
 
 class _Walk:
-    """Straight walks over the faces of a mesh to points near it, past edges of any number of faces."""
+    """Straight walks over the faces of a mesh to points near it, past edges of any number of
+    faces."""
 
-    def __init__(self, sides: Sides, faces: NDArray, corners: NDArray, normals: NDArray, patch: NDArray) -> None:
+    def __init__(
+        self, sides: Sides, faces: NDArray, corners: NDArray, normals: NDArray, patch: NDArray
+    ) -> None:
         self.sides, self.corners, self.normals, self.patch = sides, corners, normals, patch
         self._edge = np.empty((len(faces), 3), np.int64)
         self._edge[sides.face, sides.corner] = np.repeat(np.arange(len(sides.start)), sides.uses)
 
     def to(self, points: NDArray, start: NDArray, avoided: NDArray) -> NDArray[np.int64]:
-        """(N,) the face that has each of the points (N, 3), on a walk from the face ``start`` that does not enter the
-        patch ``avoided``; -1 where it leads nowhere."""
+        """(N,) the face that has each of the points (N, 3), on a walk from the face ``start`` that
+        does not enter the patch ``avoided``; -1 where it leads nowhere."""
         at = start.copy()
         out = np.full(len(points), -1, np.int64)
         left = np.arange(len(points))
@@ -229,8 +250,8 @@ class _Walk:
         return out
 
     def _across(self, face: NDArray, corner: NDArray, avoided: NDArray) -> NDArray[np.int64]:
-        """The face that goes on across the side at ``corner``: of those outside of the patch ``avoided`` the one in the
-        plane of ``face``, or nearest to it; -1 if there is none."""
+        """The face that goes on across the side at ``corner``: of those outside of the patch
+        ``avoided`` the one in the plane of ``face``, or nearest to it; -1 if there is none."""
         s = self.sides
         edge = self._edge[face, corner]
         inward = _inward(self.corners, self.normals, face, corner)
@@ -241,6 +262,8 @@ class _Walk:
             side = s.start[edge[there]] + k
             other, where = s.face[side], s.corner[side]
             on = -np.sum(inward[there] * _inward(self.corners, self.normals, other, where), axis=1)
-            better = (other != face[there]) & (self.patch[other] != avoided[there]) & (on > best[there])
+            better = (
+                (other != face[there]) & (self.patch[other] != avoided[there]) & (on > best[there])
+            )
             out[there[better]], best[there[better]] = other[better], on[better]
         return out

@@ -1,4 +1,5 @@
-"""Closed-form transfer: the start of a fit, the reference's appearance in the maps of a simpler mesh."""
+"""Closed-form transfer: the start of a fit, the reference's appearance in the maps of a simpler
+mesh."""
 
 from __future__ import annotations
 
@@ -16,17 +17,27 @@ SAMPLES = 1
 """Rays per texel. More blur the maps: a texel is read bilinearly, which averages once already."""
 
 
-def transfer(reference: MeshReference, mesh: LatentMesh, size: int, fill_hidden: bool = True) -> BakedMaps:
-    """Base colour, roughness, metalness and tangent-space normals of the reference in ``size`` x ``size``
-    maps of ``mesh``. ``fill_hidden``: smooth where nothing outside can see the reference."""
+def transfer(
+    reference: MeshReference, mesh: LatentMesh, size: int, fill_hidden: bool = True
+) -> BakedMaps:
+    """Base colour, roughness, metalness and tangent-space normals of the reference in ``size`` x
+    ``size`` maps of ``mesh``. ``fill_hidden``: smooth where nothing outside can see the
+    reference."""
     return bake(reference, mesh, Settings(size, samples=SAMPLES, fill_hidden=fill_hidden))
 
 
-def transfer_emission(reference: MeshReference, mesh: LatentMesh, size: int) -> dict[str, NDArray | float]:
-    """What the reference emits, in maps of ``mesh`` by channel name, or as numbers where it is the same everywhere;
-    empty if it does not. Images under a light do not show it, so that no fit changes it."""
+def transfer_emission(
+    reference: MeshReference, mesh: LatentMesh, size: int
+) -> dict[str, NDArray | float]:
+    """What the reference emits, in maps of ``mesh`` by channel name, or as numbers where it is the
+    same everywhere; empty if it does not. Images under a light do not show it, so that no fit
+    changes it."""
     if reference.emission is None:
         return {}
     if not reference.emission.layers:
         return dict(reference.emission.constants)
-    return {**bake(reference, mesh, Settings(size, ("emission",), samples=SAMPLES, fill_hidden=True)).maps}
+    return {
+        **bake(
+            reference, mesh, Settings(size, ("emission",), samples=SAMPLES, fill_hidden=True)
+        ).maps
+    }

@@ -20,33 +20,50 @@ if TYPE_CHECKING:
     from appearance_opt.views import ViewSampler
 
 MARGIN = 2
-"""Rings of faces around the visible ones that count as visible, too: a face smaller than a pixel can be
-missed by every ray."""
+"""Rings of faces around the visible ones that count as visible, too: a face smaller than a pixel
+can be missed by every ray."""
 
 HIDDEN, FLOOR = 1e-4, 0.05
 """Importance of faces that nobody sees, and the least importance of those that somebody does."""
 
 
 def pixel_counts(
-    scene: Scene, faces: int, sampler: ViewSampler, views: int, resolution: int = 256, batch: int = 8
+    scene: Scene,
+    faces: int,
+    sampler: ViewSampler,
+    views: int,
+    resolution: int = 256,
+    batch: int = 8,
 ) -> NDArray[np.int64]:
     """(faces,) number of pixels in which each face was seen over ``views`` random views."""
     total = dr.zeros(mi.UInt32, faces)
     grid = Grid(batch, resolution)
     for k in range(-(-views // batch)):
         records = sampler.draw(k, batch).records()
-        hits = rays.trace(scene, records, grid.view, mi.Float(grid.column) + 0.5, mi.Float(grid.row) + 0.5, grid.size)
+        hits = rays.trace(
+            scene,
+            records,
+            grid.view,
+            mi.Float(grid.column) + 0.5,
+            mi.Float(grid.row) + 0.5,
+            grid.size,
+        )
         seen = hits.triangle != rays.MISS
-        dr.scatter_reduce(dr.ReduceOp.Add, total, mi.UInt32(1), dr.select(seen, hits.triangle, 0), seen)
+        dr.scatter_reduce(
+            dr.ReduceOp.Add, total, mi.UInt32(1), dr.select(seen, hits.triangle, 0), seen
+        )
         dr.eval(total)
     return np.array(total).astype(np.int64)
 
 
-def importance(positions: NDArray, faces: NDArray, counts: NDArray) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+def importance(
+    positions: NDArray, faces: NDArray, counts: NDArray
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """(importance (F,) in (0, 1], visible (F,)) from the pixels in which faces were seen.
 
-    Importance is pixels per area, averaged over the faces around each vertex and relative to the best
-    seen part of the surface, so that recesses and undersides get a smaller share of the triangles.
+    Importance is pixels per area, averaged over the faces around each vertex and relative to the
+    best seen part of the surface, so that recesses and undersides get a smaller share of the
+    triangles.
     """
     f, area, n = welded_areas(positions, faces)
     visible = counts > 0
@@ -61,8 +78,8 @@ def importance(positions: NDArray, faces: NDArray, counts: NDArray) -> tuple[NDA
 
 
 def welded_areas(positions: NDArray, faces: NDArray) -> tuple[NDArray, NDArray[np.float64], int]:
-    """(faces over welded vertices (F, 3), their areas (F,), number of welded vertices). Faces that coincide share the
-    area of their place, as they share the pixels that show it."""
+    """(faces over welded vertices (F, 3), their areas (F,), number of welded vertices). Faces that
+    coincide share the area of their place, as they share the pixels that show it."""
     first, place = weld(np.asarray(positions))
     f = place[faces]
     p = np.asarray(positions, np.float64)[first]

@@ -1,4 +1,5 @@
-"""Bake: a heavy asset's look in the maps of a light one, which keeps its shape and its texture coordinates."""
+"""Bake: a heavy asset's look in the maps of a light one, which keeps its shape and its texture
+coordinates."""
 
 from __future__ import annotations
 
@@ -41,9 +42,10 @@ MISSED_NOTE, MISSED_ERROR = 0.01, 0.5
 
 @dataclass
 class BakeResult:
-    """What ``bake`` did. ``asset``: LOW with the maps; ``closed_form``: the same before the fit; ``fit``: None
-    without one; ``maps``: channel name -> (size, size), lengths in metres; ``covered``, ``missed``: texels of
-    charts, and those whose rays found nothing; ``reach``: how far rays went, metres; ``seconds`` by stage."""
+    """What ``bake`` did. ``asset``: LOW with the maps; ``closed_form``: the same before the fit;
+    ``fit``: None without one; ``maps``: channel name -> (size, size), lengths in metres;
+    ``covered``, ``missed``: texels of charts, and those whose rays found nothing; ``reach``: how
+    far rays went, metres; ``seconds`` by stage."""
 
     asset: Asset
     closed_form: Asset
@@ -74,16 +76,20 @@ def bake(
     began: float | None = None,
     inputs: Iterable[str | Path] = (),
 ) -> BakeResult:
-    """Bake ``high`` to ``low`` (paths or assets) and write LOW with its new maps to ``out`` (None: do not write).
+    """Bake ``high`` to ``low`` (paths or assets) and write LOW with its new maps to ``out`` (None:
+    do not write).
 
-    ``report``: folder for pictures, metrics and report.html. ``textures``: folder for the maps as loose files;
-    maps for which the format of ``out`` has no place are always written, by default to ``<out's stem>_maps``.
-    ``inputs``: other files that must not be replaced. Raises AppearanceError.
+    ``report``: folder for pictures, metrics and report.html. ``textures``: folder for the maps as
+    loose files; maps for which the format of ``out`` has no place are always written, by default to
+    ``<out's stem>_maps``. ``inputs``: other files that must not be replaced. Raises
+    AppearanceError.
     """
     from appearance_opt.jobs.fitting import Stopwatch
 
     if options.joint:
-        raise InputError("joint bakes have a function of their own, appearance_opt.joint, with another result")
+        raise InputError(
+            "joint bakes have a function of their own, appearance_opt.joint, with another result"
+        )
     watch = Stopwatch(began, progress)
     outputs = Outputs.of(out, options, report=report, textures=textures)
     outputs.check()
@@ -104,7 +110,9 @@ def _bake(
 ) -> BakeResult:
     from appearance_opt.jobs.fitting import conclude
 
-    run = BakeJob(*read_pair(high, low, outputs, options, variants, watch), options, watch, interrupts)
+    run = BakeJob(
+        *read_pair(high, low, outputs, options, variants, watch), options, watch, interrupts
+    )
     result, error = run.run(progress, outputs.report is not None)
     if outputs.out is not None:
         with publication() as together:
@@ -133,8 +141,8 @@ def read_pair(
     variants: dict[str, str] | None,
     watch: Stopwatch,
 ) -> tuple[Parts, Parts, str]:
-    """(what of HIGH is baked, what of LOW is baked onto, what to call LOW). Raises InputError if it is nothing, or if
-    the outputs would replace a file of either."""
+    """(what of HIGH is baked, what of LOW is baked onto, what to call LOW). Raises InputError if it
+    is nothing, or if the outputs would replace a file of either."""
     from appearance_opt.jobs.simplify import load_source
 
     watch.begin("reading both meshes")
@@ -144,11 +152,16 @@ def read_pair(
     watch.lap("load")
     watch.begin(f"preparing {heavy.triangle_count:,} and {light.triangle_count:,} triangles")
     names = [str(a) if isinstance(a, (str, Path)) else a.name for a in (high, low)]
-    return split(heavy, f"HIGH, {names[0]}", "bake"), split(light, f"LOW, {names[1]}", "bake onto", False), names[1]
+    return (
+        split(heavy, f"HIGH, {names[0]}", "bake"),
+        split(light, f"LOW, {names[1]}", "bake onto", False),
+        names[1],
+    )
 
 
 def load_low(source: str | Path | Asset, options: BakeOptions) -> Asset:
-    """LOW itself, or the file of that name with its vertices and texture coordinates as they are."""
+    """LOW itself, or the file of that name with its vertices and texture coordinates as they
+    are."""
     if not isinstance(source, (str, Path)):
         return source
     given = {"missing_textures": options.missing_textures, "root": options.root}
@@ -156,8 +169,8 @@ def load_low(source: str | Path | Asset, options: BakeOptions) -> Asset:
 
 
 class BakeJob:
-    """Both assets under one placement; then the closed form, then the fit. ``high``: all of HIGH, where it was aligned;
-    ``low_parts``: what of LOW is baked onto, and what is left alone."""
+    """Both assets under one placement; then the closed form, then the fit. ``high``: all of HIGH,
+    where it was aligned; ``low_parts``: what of LOW is baked onto, and what is left alone."""
 
     def __init__(
         self,
@@ -173,10 +186,18 @@ class BakeJob:
         from appearance_opt.reference.mesh import MeshReference
         from appearance_opt.views import views_around
 
-        self.options, self.watch, self.interrupts, self.low_parts = options, watch, interrupts, low_parts
+        self.options, self.watch, self.interrupts, self.low_parts = (
+            options,
+            watch,
+            interrupts,
+            low_parts,
+        )
         high, low = high_parts.fitted, low_parts.fitted
         self.notes = [*high.notes, *high_parts.describe_kept("of HIGH are not baked")]
-        self.notes += [*(f"LOW: {n}" for n in low.notes), *low_parts.describe_kept("of LOW stay as they are")]
+        self.notes += [
+            *(f"LOW: {n}" for n in low.notes),
+            *low_parts.describe_kept("of LOW stay as they are"),
+        ]
         self.high = high_parts.whole
         if options.align:
             high, self.high = self._align(high_parts, low)
@@ -201,10 +222,15 @@ class BakeJob:
         from appearance_opt.baking.align import align
 
         placed, scale, shift = align(high_parts.fitted, low)
-        self.notes.append(f"HIGH was scaled by {scale:.6g} and moved by {', '.join(f'{x:.6g}' for x in shift)} m")
+        self.notes.append(
+            f"HIGH was scaled by {scale:.6g} and moved by {', '.join(f'{x:.6g}' for x in shift)} m"
+        )
         from_world = shift + scale * np.array(high_parts.fitted.origin) - low.origin
         kept = tuple(
-            replace(m, positions=(m.positions.astype(np.float64) * scale + from_world).astype(np.float32))
+            replace(
+                m,
+                positions=(m.positions.astype(np.float64) * scale + from_world).astype(np.float32),
+            )
             for m in high_parts.kept
         )
         return placed, replace(high_parts, fitted=placed, kept=kept).whole
@@ -218,9 +244,13 @@ class BakeJob:
             return self.sampler, self.placement
         points = np.concatenate([self.high.points(), low.points()])
         placement = Placement.around(points)
-        return views_around(placement.to_local(points), self.options.seed, self.options.light), placement
+        return views_around(
+            placement.to_local(points), self.options.seed, self.options.light
+        ), placement
 
-    def run(self, progress: Progress | None, with_report: bool) -> tuple[BakeResult, DivergedError | None]:
+    def run(
+        self, progress: Progress | None, with_report: bool
+    ) -> tuple[BakeResult, DivergedError | None]:
         """The closed form, and the fit that starts from it."""
         from appearance_opt.baking.closed_form import bake as bake_closed_form
         from appearance_opt.jobs.fitting import fit_start
@@ -244,7 +274,12 @@ class BakeJob:
         parts = self._fitted_parts()
         if not parts:
             return result, None
-        start = Start(self.mesh, select_told(self.reference, {n: baked.maps[n] for n in _FITTED}), True, baked.covered)
+        start = Start(
+            self.mesh,
+            select_told(self.reference, {n: baked.maps[n] for n in _FITTED}),
+            True,
+            baked.covered,
+        )
         options = replace(self.options, fit=parts)
         model, fitted, error = fit_start(
             self.reference,
@@ -256,7 +291,8 @@ class BakeJob:
             progress=progress,
             with_report=with_report,
         )
-        # gutters were filled before the fit, which moved those that lookups reach: filling again would undo that
+        # gutters were filled before the fit, which moved those that lookups reach: filling again
+        # would undo that
         maps = {**baked.maps, **model.host_maps()}
         result.fit, result.asset, result.maps = fitted, self._result(maps), self._in_metres(maps)
         self.notes += fitted.notes()
@@ -292,7 +328,8 @@ class BakeJob:
         )
 
     def _fitted_parts(self) -> tuple[str, ...]:
-        """What the fit moves: parts that are written. Colour and roughness are fitted together or not at all."""
+        """What the fit moves: parts that are written. Colour and roughness are fitted together or
+        not at all."""
         o = self.options
         if self.reference.unlit:
             written = {"normal": False, "material": o.wants("base-color")}
@@ -311,7 +348,9 @@ class BakeJob:
                 "give a larger --cage, or --align if the two lie apart"
             )
         if share > MISSED_NOTE:
-            self.notes.append(f"{100 * share:.1f} % of the texels found nothing within {reach} and were filled")
+            self.notes.append(
+                f"{100 * share:.1f} % of the texels found nothing within {reach} and were filled"
+            )
 
     def _in_metres(self, maps: dict[str, NDArray]) -> dict[str, NDArray[np.float32]]:
         scale = self.placement.scale
@@ -324,7 +363,9 @@ class BakeJob:
 
         change = material_change(self._in_metres(maps), self.options, self.reference.unlit)
         asset = with_material(self.low.asset, change)
-        if self.options.wants("base-color"):  # the map holds the whole colour: vertex colours would tint it again
+        if self.options.wants(
+            "base-color"
+        ):  # the map holds the whole colour: vertex colours would tint it again
             asset = replace(asset, meshes=tuple(replace(m, colors=None) for m in asset.meshes))
         return self.low_parts.with_kept(replace(asset, notes=()))
 
@@ -338,11 +379,15 @@ def _write_loose(
     """Loose files, if asked for or if the format of ``out`` has no place for one of the maps."""
     from appearance_opt.baking.encode import loose_files
 
-    placeless = options.wants("object-normal") or options.wants("curvature") or options.green == "directx"
+    placeless = (
+        options.wants("object-normal") or options.wants("curvature") or options.green == "directx"
+    )
     placeless |= options.wants("ao") and not options.wants("orm")
     placeless |= options.wants("displacement") and out.suffix.lower() == ".obj"
     if folder is None and not placeless:
         return
     target = out.with_name(out.stem + "_maps") if folder is None else folder
-    for name, data in loose_files(result.maps, result.covered, result.missed, options, out.stem).items():
+    for name, data in loose_files(
+        result.maps, result.covered, result.missed, options, out.stem
+    ).items():
         together.place(target / name).write_bytes(data)

@@ -37,10 +37,11 @@ def compare(
     crease_angle: float | None = None,
     variants: dict[str, str] | None = None,
 ) -> Comparison:
-    """Render both assets from ``views`` random cameras under random lights and measure the difference.
-    ``out``: folder for a report with pictures. ``refine``, ``missing_textures``, ``root``, ``crease_angle``: see
-    ``load``; ``variants``: of the reference. What is transparent is drawn so (see ``render.layers``). Raises
-    AppearanceError, also if one of the two shows nothing."""
+    """Render both assets from ``views`` random cameras under random lights and measure the
+    difference. ``out``: folder for a report with pictures. ``refine``, ``missing_textures``,
+    ``root``, ``crease_angle``: see ``load``; ``variants``: of the reference. What is transparent is
+    drawn so (see ``render.layers``). Raises AppearanceError, also if one of the two shows
+    nothing."""
     if device not in DEVICES:
         raise InputError(f"--device {device}: choose from {', '.join(DEVICES)}")
     if seed < 0:
@@ -48,18 +49,26 @@ def compare(
     outputs = Outputs.of(None, report=out)
     outputs.check()
     outputs.check_sources(reference, candidate)
-    reading = {"refine": refine, "missing_textures": missing_textures, "root": root, "crease_angle": crease_angle}
+    reading = {
+        "refine": refine,
+        "missing_textures": missing_textures,
+        "root": root,
+        "crease_angle": crease_angle,
+    }
     with outputs.held():
         given = ((reference, {**reading, "variants": variants}), (candidate, reading))
         return _compare(given, outputs, (views, resolution, samples, seed, device))
 
 
 def _compare(
-    both: tuple[tuple[str | Path | Asset, dict[str, Any]], tuple[str | Path | Asset, dict[str, Any]]],
+    both: tuple[
+        tuple[str | Path | Asset, dict[str, Any]], tuple[str | Path | Asset, dict[str, Any]]
+    ],
     outputs: Outputs,
     drawing: tuple[int, int, int, int, str],
 ) -> Comparison:
-    """``both``: each with how it is to be read; ``drawing``: views, resolution, samples, seed, device."""
+    """``both``: each with how it is to be read; ``drawing``: views, resolution, samples, seed,
+    device."""
     from appearance_opt.asset import load
     from appearance_opt.asset.types import Asset
 
@@ -78,13 +87,17 @@ def _compare(
     in_one = placement.local(first), placement.local(second)
     try:
         result = compare_local(*in_one, sampler, views, resolution, samples)
-    except InputError as error:  # of two small things far from each other, pictures may show neither
+    except (
+        InputError
+    ) as error:  # of two small things far from each other, pictures may show neither
         raise InputError("; ".join([str(error), *apart])) from error
     if outputs.report is not None:
         from appearance_opt.jobs.report import write_compare_report
 
         write_compare_report(outputs.report, first, second, result)
-    return replace(result, notes=(*first.notes, *second.notes, *apart, *_drawn_otherwise(first, second)))
+    return replace(
+        result, notes=(*first.notes, *second.notes, *apart, *_drawn_otherwise(first, second))
+    )
 
 
 def _apart(reference: Asset, candidate: Asset) -> list[str]:
@@ -103,4 +116,6 @@ def _drawn_otherwise(*assets: Asset) -> list[str]:
     """A note on what the pictures show differently from what the files say."""
     if all(kind_of(m.material) != "transmission" for a in assets for m in a.meshes):
         return []
-    return ["transmission is drawn like blended alpha: nothing is refracted, coloured inside or blurred"]
+    return [
+        "transmission is drawn like blended alpha: nothing is refracted, coloured inside or blurred"
+    ]

@@ -1,4 +1,5 @@
-"""What jobs with a displacement map share: its size, its closed-form start, memory, and what is written."""
+"""What jobs with a displacement map share: its size, its closed-form start, memory, and what is
+written."""
 
 from __future__ import annotations
 
@@ -38,27 +39,30 @@ FILLED = 0.6
 MAX_GUTTER = 16
 
 SAMPLES = 4
-"""Rays per texel of the closed-form displacement. Hits on walls that are steep to the ray are kept: leaving them out
-costs 0.9 dB on chess_king, whose rims are such walls."""
+"""Rays per texel of the closed-form displacement. Hits on walls that are steep to the ray are kept:
+leaving them out costs 0.9 dB on chess_king, whose rims are such walls."""
 
 REACH = 0.5
-"""How far a decimated mesh is displaced at most, in its own median edges: farther away lies another part."""
+"""How far a decimated mesh is displaced at most, in its own median edges: farther away lies another
+part."""
 
 AROUND, OUTLIER = 5, 0.5
-"""A displacement that differs from the median of a square of ``AROUND`` texels by more than ``OUTLIER`` tessellated
-edges is a ray that met another part, where surfaces lie close together; the median takes its place. On chess_king these
-are 0.3 % of the texels, and with ``REACH`` the start gains 2.2 dB."""
+"""A displacement that differs from the median of a square of ``AROUND`` texels by more than
+``OUTLIER`` tessellated edges is a ray that met another part, where surfaces lie close together; the
+median takes its place. On chess_king these are 0.3 % of the texels, and with ``REACH`` the start
+gains 2.2 dB."""
 
 BYTES_PER_TRIANGLE = 700
-"""Memory of a fit for each tessellated triangle, all levels together. Measured 500 to 550 on two threads
-(docs/displacement.md); gradients have a copy for each thread."""
+"""Memory of a fit for each tessellated triangle, all levels together. Measured 500 to 550 on two
+threads (docs/displacement.md); gradients have a copy for each thread."""
 
 BYTES_AT_LEAST = 1 << 29
 """What a job takes apart from that: libraries, kernels, maps, images."""
 
 
 def require_memory(triangles: int, options: CommonOptions) -> None:
-    """Raise InputError with the numbers if tessellating ``triangles`` would exceed the memory that is free."""
+    """Raise InputError with the numbers if tessellating ``triangles`` would exceed the memory that
+    is free."""
     free = memory.available_memory()
     if not options.displaced or free is None:
         return
@@ -73,8 +77,9 @@ def require_memory(triangles: int, options: CommonOptions) -> None:
 
 
 def gutter(triangles: int, options: CommonOptions) -> int:
-    """Texels between the charts of a new atlas: two edges of the finest tessellation, for a vertex on the rim of
-    a chart reads its displacement from texels on both sides, in coarser mip levels where its edges are longer."""
+    """Texels between the charts of a new atlas: two edges of the finest tessellation, for a vertex
+    on the rim of a chart reads its displacement from texels on both sides, in coarser mip levels
+    where its edges are longer."""
     if not options.displaced:
         return GUTTER
     area = FILLED * options.texture_size**2 / (triangles * 4 ** max(options.levels()))
@@ -82,8 +87,8 @@ def gutter(triangles: int, options: CommonOptions) -> int:
 
 
 def map_size(mesh: LatentMesh, options: CommonOptions) -> int:
-    """Texels per side of the displacement map: the power of two at which a texel is just not longer than half an
-    edge of the finest tessellation, which is what its vertices read."""
+    """Texels per side of the displacement map: the power of two at which a texel is just not longer
+    than half an edge of the finest tessellation, which is what its vertices read."""
     half_edge = float(np.sqrt(np.median(footprint(tessellate(mesh, max(options.levels())).mesh))))
     return int(np.clip(2 ** np.ceil(np.log2(1 / max(half_edge, 1e-6))), 16, options.texture_size))
 
@@ -97,8 +102,9 @@ def flat_map(mesh: LatentMesh, options: CommonOptions) -> NDArray[np.float32]:
 def bake_displacement(
     reference: MeshReference, mesh: LatentMesh, options: CommonOptions, reach: float | None = None
 ) -> tuple[LatentMesh, dict[str, NDArray[np.float32]]]:
-    """Closed form: the displacement map that rays along the interpolated normals find within ``reach`` (None: the
-    automatic cage), and the mesh that it makes at the finest level, to whose tangent bases the other maps belong."""
+    """Closed form: the displacement map that rays along the interpolated normals find within
+    ``reach`` (None: the automatic cage), and the mesh that it makes at the finest level, to whose
+    tangent bases the other maps belong."""
     size, level = map_size(mesh, options), max(options.levels())
     settings = Settings(size, (DISPLACEMENT,), samples=SAMPLES, reach=reach)
     found = bake(reference, mesh, settings).maps[DISPLACEMENT]
@@ -119,8 +125,8 @@ def median_edge(mesh: LatentMesh) -> float:
 
 
 def without_outliers(heights: NDArray[np.float32], tolerance: float) -> NDArray[np.float32]:
-    """Heights of which none differs from the median around it by more than ``tolerance``; those that did
-    become that median."""
+    """Heights of which none differs from the median around it by more than ``tolerance``; those
+    that did become that median."""
     middle = median_filter(heights, AROUND)
     return np.where(np.abs(heights - middle) > tolerance, middle, heights).astype(np.float32)
 
@@ -139,19 +145,28 @@ class Exporter:
         if heights is None:
             return asset
         displacement = displacement_of(heights * np.float32(self.placement.scale))
-        meshes = (replace(m, material=replace(m.material, displacement=displacement)) for m in asset.meshes)
+        meshes = (
+            replace(m, material=replace(m.material, displacement=displacement))
+            for m in asset.meshes
+        )
         return replace(asset, meshes=tuple(meshes))
 
     def drawn(self, model: Model, maps: dict) -> dict[int, Asset]:
         """The mesh as it is drawn at each tessellation level."""
-        return {k: self._asset(*model.host_drawn(k), maps, f"{self.name}_level{k}") for k in model.levels}
+        return {
+            k: self._asset(*model.host_drawn(k), maps, f"{self.name}_level{k}")
+            for k in model.levels
+        }
 
     def _asset(self, mesh: LatentMesh, positions: NDArray, maps: dict, name: str) -> Asset:
-        return replace(to_asset(mesh, self.placement.to_world(positions), maps, name), origin=self.origin)
+        return replace(
+            to_asset(mesh, self.placement.to_world(positions), maps, name), origin=self.origin
+        )
 
 
 def write_companion(asset: Asset, out: Path) -> None:
-    """The displacement map as ``<stem>_displacement.png`` for a format that has no place for its name."""
+    """The displacement map as ``<stem>_displacement.png`` for a format that has no place for its
+    name."""
     displacement = asset.meshes[0].material.displacement
     if displacement is not None and out.suffix.lower() == ".obj":
         out.with_name(f"{out.stem}_displacement.png").write_bytes(height_png(displacement))

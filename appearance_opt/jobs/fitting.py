@@ -36,12 +36,13 @@ log = logging.getLogger(__name__)
 VALIDATION_VIEWS = 8
 
 POOL_SAMPLES = 8
-"""Rays per pixel of the reference's images where outlines pass. More views with fewer rays are worth more than fewer
-with many: each view is seen a few times only, and the errors of all of them average out."""
+"""Rays per pixel of the reference's images where outlines pass. More views with fewer rays are
+worth more than fewer with many: each view is seen a few times only, and the errors of all of them
+average out."""
 
 DISPLACEMENT_RATE = 4.0
-"""Rate of the displacement map in units of that of the normal map: its texels move by a fraction of the finest
-edge, which is an eighth of the base edge at level 3."""
+"""Rate of the displacement map in units of that of the normal map: its texels move by a fraction of
+the finest edge, which is an eighth of the base edge at level 3."""
 
 EXPORT_SECONDS = 1.0
 """Time kept back from the budget for writing the result; the report has a reserve of its own."""
@@ -50,8 +51,8 @@ REPORT_SECONDS = 5.0
 
 
 class Stopwatch:
-    """Seconds by stage. ``began``: ``time.perf_counter()`` of the start, by default now. ``progress``: told what
-    begins."""
+    """Seconds by stage. ``began``: ``time.perf_counter()`` of the start, by default now.
+    ``progress``: told what begins."""
 
     def __init__(self, began: float | None = None, progress: Progress | None = None) -> None:
         self._progress = progress
@@ -83,15 +84,18 @@ class Timed(Protocol):
 
 
 def conclude(result: Timed, watch: Stopwatch, write_report: Callable[[], None] | None) -> None:
-    """Write the report, if there is to be one, and note the time of every stage. The result is written already: a
-    Ctrl-C from here on, the imports of the report included, ends the report alone."""
+    """Write the report, if there is to be one, and note the time of every stage. The result is
+    written already: a Ctrl-C from here on, the imports of the report included, ends the report
+    alone."""
     if write_report is not None:
         watch.begin("drawing the report")
         result.seconds = dict(watch.stages)
         try:
             write_report()
         except KeyboardInterrupt:
-            result.notes.append("interrupted while the report was made: the result is complete, the report is missing")
+            result.notes.append(
+                "interrupted while the report was made: the result is complete, the report is missing"
+            )
         watch.lap("report")
     result.seconds = {**watch.stages, "total": watch.total}
 
@@ -110,20 +114,26 @@ def fit_start(
     checkpointer: Checkpointer | None = None,
     with_report: bool = False,
 ) -> tuple[Model, FitResult, DivergedError | None]:
-    """Fit what ``options.fit`` names, from ``start``, within what is left of the budget on ``watch``.
+    """Fit what ``options.fit`` names, from ``start``, within what is left of the budget on
+    ``watch``.
 
-    The model is left at its best state by held-out PSNR; so it is when the fit diverged, which is returned
-    rather than raised: the state is worth writing first. From here on ``interrupts`` protect the result.
+    The model is left at its best state by held-out PSNR; so it is when the fit diverged, which is
+    returned rather than raised: the state is worth writing first. From here on ``interrupts``
+    protect the result.
     """
     interrupts.protect()
     o = options
     width = point_width(o.resolution, o.texture_size)
-    pool = ReferencePool(reference, sampler, o.pool, o.views, o.resolution, POOL_SAMPLES, width, o.reuse)
+    pool = ReferencePool(
+        reference, sampler, o.pool, o.views, o.resolution, POOL_SAMPLES, width, o.reuse
+    )
     held_out = sampler.held_out(VALIDATION).draw(0, VALIDATION_VIEWS)
     validation = Validation(reference, held_out, min(o.resolution, 256))
     parts = frozenset(o.fit) | ({DISPLACEMENT} if o.displaced else set())
     model = Model(start.mesh, start.maps, parts, Rates(), start.levels)
-    quality, rates = fit_policy(validation.psnr(model), start.relative, start.grown, patience(o, watch, with_report))
+    quality, rates = fit_policy(
+        validation.psnr(model), start.relative, start.grown, patience(o, watch, with_report)
+    )
     given = (o.position_rate, o.normal_rate, o.color_rate, o.material_rate, o.displacement_rate)
     defaults = (rates.position, rates.normal, rates.base_color, rates.material, rates.displacement)
     model.set_rates(Rates(*(d if g is None else g for g, d in zip(given, defaults, strict=True))))
@@ -164,33 +174,36 @@ def seconds_left(options: CommonOptions, watch: Stopwatch, with_report: bool) ->
 
 
 def point_width(resolution: int, texture_size: int) -> float:
-    """Width in pixels of the filter of point samples: about a texel, if the object fills both the view and the atlas.
-    Narrower would compare single texels with detail that they cannot hold, wider would blur."""
+    """Width in pixels of the filter of point samples: about a texel, if the object fills both the
+    view and the atlas. Narrower would compare single texels with detail that they cannot hold,
+    wider would blur."""
     return float(np.clip(1.25 * resolution / texture_size, 0.4, 2.0))
 
 
 GROWN_RATE = 0.032
-"""Learning rates from a grown shape, which is rough however well it does: after 65 seconds with half, once, twice,
-four and eight times 0.008 spot (28 dB at the start) ends at 30.0, 30.9, 32.4, 33.5 and 33.4 dB and chess_king in grey
-(25 dB) at 27.5, 28.7, 28.8, 29.1 and 28.3."""
+"""Learning rates from a grown shape, which is rough however well it does: after 65 seconds with
+half, once, twice, four and eight times 0.008 spot (28 dB at the start) ends at 30.0, 30.9, 32.4,
+33.5 and 33.4 dB and chess_king in grey (25 dB) at 27.5, 28.7, 28.8, 29.1 and 28.3."""
 
 
 LEAST_RATE_SHARE = 0.25
-"""Least share of the rates for starts that are better than 35 dB: what is left there is finer than what the views of a
-fit show."""
+"""Least share of the rates for starts that are better than 35 dB: what is left there is finer than
+what the views of a fit show."""
 
 LEAST_VERTEX_SHARE = 0.3
-"""Least share of the rate of vertices, on top of that, for starts that are better than 34 dB: a vertex that moves turns
-the bumps of the normal map around it. After 600 steps, in the eyes of another renderer, chess_king at 8,104 triangles
-(37 dB), which starts at 37.2 to 37.5 dB, ends 0.6 dB below its start with half of all rates, 0.2 below with this share
-of the vertices' as well, and level with it with both least shares; spot at 4,684 (41 dB), which starts at 41.4, ends at
+"""Least share of the rate of vertices, on top of that, for starts that are better than 34 dB: a
+vertex that moves turns the bumps of the normal map around it. After 600 steps, in the eyes of
+another renderer, chess_king at 8,104 triangles (37 dB), which starts at 37.2 to 37.5 dB, ends 0.6
+dB below its start with half of all rates, 0.2 below with this share of the vertices' as well, and
+level with it with both least shares; spot at 4,684 (41 dB), which starts at 41.4, ends at
 43.04 and 42.97 with the first two. At 2,432 triangles (34.6 dB) chess_king gains 0.23 dB by a third of the vertices'
 rate, at 1,404 (33.4 dB) spot loses 0.23."""
 
 
 LONG = (600, 40.0)
-"""Steps or seconds of a fit that is long enough for the least rates. In a draft, of some 150 steps, they gain nothing:
-spot at 4,684 triangles ended at 41.46 dB with a quarter of the rates, at 42.06 with half of them."""
+"""Steps or seconds of a fit that is long enough for the least rates. In a draft, of some 150 steps,
+they gain nothing: spot at 4,684 triangles ended at 41.46 dB with a quarter of the rates, at 42.06
+with half of them."""
 
 
 def patience(options: CommonOptions, watch: Stopwatch, with_report: bool) -> float:
@@ -200,11 +213,14 @@ def patience(options: CommonOptions, watch: Stopwatch, with_report: bool) -> flo
     return min(1.0, by_steps, 1.0 if seconds is None else seconds / LONG[1])
 
 
-def fit_policy(psnr: float, likeness: bool, grown: bool = False, patience: float = 1.0) -> tuple[Quality, Rates]:
+def fit_policy(
+    psnr: float, likeness: bool, grown: bool = False, patience: float = 1.0
+) -> tuple[Quality, Rates]:
     """Sampling and learning rates for a start of the given held-out PSNR (dB).
 
-    A good start is easily spoilt: large steps undo it before they find something better. ``likeness``: False for
-    a start that knows nothing (a sphere); ``grown``: whether it was found by fitting; ``patience``: see there.
+    A good start is easily spoilt: large steps undo it before they find something better.
+    ``likeness``: False for a start that knows nothing (a sphere); ``grown``: whether it was found
+    by fitting; ``patience``: see there.
     """
     if not likeness:
         return Quality(1.0, 4, 1), Rates(0.05, 0.01, 0.02, 0.01, 0.05)
@@ -217,9 +233,10 @@ def fit_policy(psnr: float, likeness: bool, grown: bool = False, patience: float
 
 
 def clean_maps(model: Model, known: NDArray) -> dict:
-    """The model's maps and constants. Where nothing was known at the start (``known`` is false everywhere), texels
-    that no view ever touched are filled from those that one did; other starts were filled before the fit, which may
-    since have moved gutters that lookups reach: filling them again would undo that."""
+    """The model's maps and constants. Where nothing was known at the start (``known`` is false
+    everywhere), texels that no view ever touched are filled from those that one did; other starts
+    were filled before the fit, which may since have moved gutters that lookups reach: filling them
+    again would undo that."""
     maps = model.host_maps()
     out: dict = {**model.constants, **maps}
     if not maps or known.any() or model.codec is None:

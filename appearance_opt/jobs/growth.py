@@ -1,10 +1,10 @@
-"""Starts whose shape is far from its goal: grown from a sphere, where there is no mesh to decimate, or mended from a
-mesh that another tool has spoilt.
+"""Starts whose shape is far from its goal: grown from a sphere, where there is no mesh to decimate,
+or mended from a mesh that another tool has spoilt.
 
-The sphere gets several times the triangles of the budget, small maps, small views and preconditioned steps
-(``fit.smoothing``): shape first. What comes out is decimated to the budget like any other mesh, which puts triangles
-where the shape needs them (a sphere that was pulled into limbs has few at their ends), and its maps are transferred to
-an atlas of full size.
+The sphere gets several times the triangles of the budget, small maps, small views and
+preconditioned steps (``fit.smoothing``): shape first. What comes out is decimated to the budget
+like any other mesh, which puts triangles where the shape needs them (a sphere that was pulled into
+limbs has few at their ends), and its maps are transferred to an atlas of full size.
 """
 
 from __future__ import annotations
@@ -52,27 +52,32 @@ OVERSAMPLING = 3
 
 TEXTURE, RESOLUTION, VIEWS, POOL, POOL_SAMPLES, POINT_WIDTH = 256, 160, 8, 320, 16, 0.7
 TRIANGLES_PER_STRENGTH = 1500
-"""Smoothing strength of the steps grows with the triangles, so that the same part of the surface moves together."""
+"""Smoothing strength of the steps grows with the triangles, so that the same part of the surface
+moves together."""
 
 INSIDE, ROUND = 0.95, 0.6
-"""Size of the first ellipsoid in units of the box of the object, and of the sphere in units of its radius."""
+"""Size of the first ellipsoid in units of the box of the object, and of the sphere in units of its
+radius."""
 
 RATES = Rates(normal=0.01, base_color=0.02, material=0.01)
 
 POSITION_RATE = 0.12
-"""Rate of the positions for smoothing of strength 1, in units of the object's radius: preconditioned steps know no edge
-length. It grows with the square root of the strength, for the largest gradient sets the step of all vertices, and more
-smoothing takes more off it. What is right depends on the size: after 200 steps of 9,000 triangles (strength 6) from
-an ellipsoid, chess_king in grey is at 18.7, 23.7 and 24.5 dB with rates of 0.1, 0.2 and 0.4; 42 steps of 600 triangles
+"""Rate of the positions for smoothing of strength 1, in units of the object's radius:
+preconditioned steps know no edge length. It grows with the square root of the strength, for the
+largest gradient sets the step of all vertices, and more smoothing takes more off it. What is right
+depends on the size: after 200 steps of 9,000 triangles (strength 6) from an ellipsoid, chess_king
+in grey is at 18.7, 23.7 and 24.5 dB with rates of 0.1, 0.2 and 0.4; 42 steps of 600 triangles
 (strength 0.4) towards an egg lead to 27.0, 25.0 and 22.3 dB with the same ones."""
 
 MENDING = 0.5
-"""Rate for a mesh that is spoilt, not unknown, in units of that of a sphere: it has less far to go."""
+"""Rate for a mesh that is spoilt, not unknown, in units of that of a sphere: it has less far to
+go."""
 
 
 @dataclass(frozen=True)
 class Effort:
-    """How long the shape is fitted (whichever comes first), who is told, and who may end it early."""
+    """How long the shape is fitted (whichever comes first), who is told, and who may end it
+    early."""
 
     seconds: float | None
     steps: int | None
@@ -81,14 +86,23 @@ class Effort:
 
 
 def grow_start(
-    reference: Reference, sampler: ViewSampler, options: SimplifyOptions, triangles: int, effort: Effort
+    reference: Reference,
+    sampler: ViewSampler,
+    options: SimplifyOptions,
+    triangles: int,
+    effort: Effort,
 ) -> tuple[Start, bool]:
     """(start, interrupted), grown from a sphere. Only images of the reference are used."""
     texture = min(TEXTURE, options.texture_size)
     mesh = first_shape(triangles, sampler, texture)
-    maps = select_told(reference, random_maps(texture, options.seed, options.normal_map and "normal" in options.fit))
+    maps = select_told(
+        reference,
+        random_maps(texture, options.seed, options.normal_map and "normal" in options.fit),
+    )
     model, result = _fit_shape(reference, sampler, options, mesh, maps, 1.0, effort)
-    likeness = to_asset(mesh, model.host_positions(), clean_maps(model, np.zeros((texture, texture), bool)), "grown")
+    likeness = to_asset(
+        mesh, model.host_positions(), clean_maps(model, np.zeros((texture, texture), bool)), "grown"
+    )
     source = MeshReference(likeness)
     positions, faces = decimate(source.merged.positions, source.merged.faces, triangles)
     if not len(faces):
@@ -98,11 +112,15 @@ def grow_start(
 
 
 def mend_start(
-    reference: MeshReference, sampler: ViewSampler, options: SimplifyOptions, spoilt: LatentMesh, effort: Effort
+    reference: MeshReference,
+    sampler: ViewSampler,
+    options: SimplifyOptions,
+    spoilt: LatentMesh,
+    effort: Effort,
 ) -> tuple[Start, bool]:
-    """(start, interrupted): a spoilt mesh moved to where images want it, its triangles kept; atlas and
-    maps are made anew. Neighbours move together, so that lost volume comes back and a patch that lies
-    off moves as a whole, where steps of single vertices would crumple it."""
+    """(start, interrupted): a spoilt mesh moved to where images want it, its triangles kept; atlas
+    and maps are made anew. Neighbours move together, so that lost volume comes back and a patch
+    that lies off moves as a whole, where steps of single vertices would crumple it."""
     small = with_values(options, texture_size=min(TEXTURE, options.texture_size))
     maps = transfer_appearance(reference, spoilt, small).maps
     model, result = _fit_shape(reference, sampler, options, spoilt, maps, MENDING, effort)
@@ -119,13 +137,17 @@ def _fit_shape(
     pace: float,
     effort: Effort,
 ) -> tuple[Model, FitResult]:
-    """A mesh with maps after preconditioned steps, ``pace`` times as large as for a sphere; the model is left at its
-    best state."""
+    """A mesh with maps after preconditioned steps, ``pace`` times as large as for a sphere; the
+    model is left at its best state."""
     model = Model(mesh, maps, frozenset(options.fit), RATES)
     strength, rate = smoothing(len(mesh.faces))
     model.precondition(strength, pace * rate)
-    pool = ReferencePool(reference, sampler, POOL, VIEWS, RESOLUTION, POOL_SAMPLES, POINT_WIDTH, options.reuse)
-    validation = Validation(reference, sampler.held_out(VALIDATION).draw(0, VALIDATION_VIEWS), RESOLUTION)
+    pool = ReferencePool(
+        reference, sampler, POOL, VIEWS, RESOLUTION, POOL_SAMPLES, POINT_WIDTH, options.reuse
+    )
+    validation = Validation(
+        reference, sampler.held_out(VALIDATION).draw(0, VALIDATION_VIEWS), RESOLUTION
+    )
     fit_options = FitOptions(
         steps=effort.steps,
         seconds=effort.seconds,
@@ -137,8 +159,12 @@ def _fit_shape(
         seed=options.seed,
     )
     effort.interrupts.protect()
-    result = fit(model, pool, validation, fit_options, effort.progress, stop=effort.interrupts.asked)
-    log.info("shape by preconditioned steps: %d of them, %.2f dB", result.steps, result.curve[-1].psnr)
+    result = fit(
+        model, pool, validation, fit_options, effort.progress, stop=effort.interrupts.asked
+    )
+    log.info(
+        "shape by preconditioned steps: %d of them, %.2f dB", result.steps, result.curve[-1].psnr
+    )
     return model, result
 
 
@@ -154,9 +180,10 @@ def first_shape(triangles: int, sampler: ViewSampler, texture: int) -> LatentMes
 
 
 def stretch(ball: LatentMesh, sampler: ViewSampler) -> LatentMesh:
-    """The unit sphere around the origin as an ellipsoid that nearly fills the box that views are framed to (a sphere of
-    ``ROUND`` of the sampler's radius where they are not framed). A round one leaves the ends of a long object to a few
-    vertices, which do not arrive there while the steps are still large."""
+    """The unit sphere around the origin as an ellipsoid that nearly fills the box that views are
+    framed to (a sphere of ``ROUND`` of the sampler's radius where they are not framed). A round one
+    leaves the ends of a long object to a few vertices, which do not arrive there while the steps
+    are still large."""
     centre, half = np.asarray(sampler.centre, np.float64), np.full(3, ROUND * sampler.radius)
     if sampler.hull is not None:
         low, high = sampler.hull.min(axis=0), sampler.hull.max(axis=0)

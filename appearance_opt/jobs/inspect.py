@@ -10,7 +10,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from appearance_opt.asset import load, sides
-from appearance_opt.asset.alpha import FITTED, KEPT, UNLIT, Share, count_kinds, kept_apart, kind_of, separate_opaque
+from appearance_opt.asset.alpha import (
+    FITTED,
+    KEPT,
+    UNLIT,
+    Share,
+    count_kinds,
+    kept_apart,
+    kind_of,
+    separate_opaque,
+)
 from appearance_opt.asset.types import Contents, Texture
 from appearance_opt.asset.validate import Validation, repair_and_count
 
@@ -50,8 +59,8 @@ class MapFacts:
 
 @dataclass(frozen=True)
 class MaterialFacts:
-    """``seen``: opaque, mask, blend or transmission, and if it is unlit; ``simplify``: what it does with the meshes
-    that wear it."""
+    """``seen``: opaque, mask, blend or transmission, and if it is unlit; ``simplify``: what it does
+    with the meshes that wear it."""
 
     name: str
     meshes: int
@@ -64,10 +73,11 @@ class MaterialFacts:
 
 @dataclass(frozen=True)
 class Inspection:
-    """``size``: extent along x, y, z in metres; ``origin``: see ``Asset``; ``file_bytes``: of the ``files`` that the
-    asset is made of; ``single_sided``: triangles that are fitted and seen from one side, and ``backs_in_sight`` those
-    among them whose backs may come into sight (see ``asset.sides``); ``texture_bytes``: of their pixels as they are
-    stored here, uncompressed, without mip levels."""
+    """``size``: extent along x, y, z in metres; ``origin``: see ``Asset``; ``file_bytes``: of the
+    ``files`` that the asset is made of; ``single_sided``: triangles that are fitted and seen from
+    one side, and ``backs_in_sight`` those among them whose backs may come into sight (see
+    ``asset.sides``); ``texture_bytes``: of their pixels as they are stored here, uncompressed,
+    without mip levels."""
 
     name: str
     files: int
@@ -104,10 +114,20 @@ class Inspection:
         ]
         for what, names in (("skins", self.contents.skins), ("clips", self.contents.clips)):
             out += _list_names(f"{what:12}", names, f"{len(names)}: ") if names else []
-        out += _list_names(f"{'variants':12}", self.contents.variants) if self.contents.variants else []
+        out += (
+            _list_names(f"{'variants':12}", self.contents.variants)
+            if self.contents.variants
+            else []
+        )
         if any(self.origin):
-            out.append("far away    its middle is near ({:.10g}, {:.10g}, {:.10g}) m".format(*self.origin))
-        faults = {k: v for k, v in asdict(self.counts).items() if v and k not in ("triangles", "connected_parts")}
+            out.append(
+                "far away    its middle is near ({:.10g}, {:.10g}, {:.10g}) m".format(*self.origin)
+            )
+        faults = {
+            k: v
+            for k, v in asdict(self.counts).items()
+            if v and k not in ("triangles", "connected_parts")
+        }
         out.append(f"to look at  {'' if faults else 'nothing'}".rstrip())
         out += [f"  {name.replace('_', ' '):24}{count:,}" for name, count in faults.items()]
         out.append("simplify")
@@ -120,7 +140,9 @@ class Inspection:
             out += _material_lines(material)
         if len(self.materials) > LISTED:
             rest = self.materials[LISTED:]
-            out.append(f"... and {len(rest):,} more, of {sum(m.triangles for m in rest):,} triangles")
+            out.append(
+                f"... and {len(rest):,} more, of {sum(m.triangles for m in rest):,} triangles"
+            )
         return out + [f"note: {note}" for note in self.notes]
 
 
@@ -133,7 +155,8 @@ def inspect(
     root: str | Path | None = None,
     crease_angle: float | None = None,
 ) -> Inspection:
-    """What is in a file, and what is wrong with it. The options are those of ``load``. Raises InputError."""
+    """What is in a file, and what is wrong with it. The options are those of ``load``. Raises
+    InputError."""
     given = load(
         source,
         refine=refine,
@@ -197,7 +220,9 @@ def _facts(material: Material, meshes: Sequence[Mesh], kept: bool) -> MaterialFa
         seen=kind_of(material) + (f", {UNLIT}" if material.unlit else ""),
         double_sided=material.double_sided,
         simplify=KEPT if kept else FITTED,
-        maps=tuple(_map_facts(MAPS[name], texture) for name, texture in given if texture is not None),
+        maps=tuple(
+            _map_facts(MAPS[name], texture) for name, texture in given if texture is not None
+        ),
     )
 
 
@@ -211,7 +236,9 @@ def _material_lines(m: MaterialFacts) -> list[str]:
     worn = "" if m.meshes == 1 else f" in {m.meshes:,} meshes"
     head = f"'{m.name}': {m.triangles:,} triangles{worn}, {m.seen}, {sides}; {m.simplify}"
     spaces = {"srgb": "sRGB", "linear": "linear"}
-    maps = [f"{t.map} {t.width} x {t.height}, {t.bits} bit, {spaces[t.color_space]}" for t in m.maps]
+    maps = [
+        f"{t.map} {t.width} x {t.height}, {t.bits} bit, {spaces[t.color_space]}" for t in m.maps
+    ]
     return [*_wrap("  ", head), *(line for text in maps for line in _wrap("      ", text))]
 
 
@@ -221,7 +248,9 @@ def _list_names(head: str, names: Sequence[str], count: str = "") -> list[str]:
 
 
 def _wrap(head: str, text: str) -> list[str]:
-    return textwrap.wrap(text, COLUMNS, initial_indent=head, subsequent_indent=" " * max(len(head), 6))
+    return textwrap.wrap(
+        text, COLUMNS, initial_indent=head, subsequent_indent=" " * max(len(head), 6)
+    )
 
 
 def _some(count: int, one: str, many: str = "") -> str:

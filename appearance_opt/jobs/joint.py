@@ -1,4 +1,5 @@
-"""Bake with the shape free: LOW's vertices, a displacement map, normals and material fitted together."""
+"""Bake with the shape free: LOW's vertices, a displacement map, normals and material fitted
+together."""
 
 from __future__ import annotations
 
@@ -35,9 +36,10 @@ def joint(
     began: float | None = None,
     inputs: Iterable[str | Path] = (),
 ) -> SimplifyResult:
-    """Fit base shape, displacement, normals and material of ``low`` to ``high`` and write the result to ``out``
-    (None: do not write). LOW keeps its topology and its texture coordinates; each kind of detail goes where it
-    is represented best. ``inputs``: other files that must not be replaced. Raises AppearanceError."""
+    """Fit base shape, displacement, normals and material of ``low`` to ``high`` and write the
+    result to ``out`` (None: do not write). LOW keeps its topology and its texture coordinates; each
+    kind of detail goes where it is represented best. ``inputs``: other files that must not be
+    replaced. Raises AppearanceError."""
     from appearance_opt.jobs.fitting import Stopwatch
 
     watch = Stopwatch(began, progress)
@@ -83,7 +85,9 @@ def _fit_pair(
     return result
 
 
-def _fit_job(job: BakeJob, options: BakeOptions, progress: Progress | None, with_report: bool) -> SimplifyResult:
+def _fit_job(
+    job: BakeJob, options: BakeOptions, progress: Progress | None, with_report: bool
+) -> SimplifyResult:
     from appearance_opt.baking.closed_form import Settings, bake
     from appearance_opt.baking.target_mesh import movable
     from appearance_opt.fit.model import Model, Rates
@@ -98,8 +102,16 @@ def _fit_job(job: BakeJob, options: BakeOptions, progress: Progress | None, with
     drawn, displacement = bake_displacement(job.reference, mesh, options, job.cage)
     found = bake(job.reference, drawn, Settings(options.texture_size, samples=options.samples))
     job.check_missed(found)
-    maps = {n: v for n, v in found.maps.items() if options.wants("normal") or not n.startswith("normal")}
-    start = Start(mesh, {**select_told(job.reference, maps), **displacement}, True, found.covered, options.levels())
+    maps = {
+        n: v for n, v in found.maps.items() if options.wants("normal") or not n.startswith("normal")
+    }
+    start = Start(
+        mesh,
+        {**select_told(job.reference, maps), **displacement},
+        True,
+        found.covered,
+        options.levels(),
+    )
     job.watch.lap("closed form")
     parts = tuple(dict.fromkeys(("shape", *options.fit)))
     model, fitted, error = fit_start(

@@ -14,8 +14,9 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Parts:
-    """``fitted``: what a job works on, with the notes and files of the whole; ``kept``: meshes that it leaves alone:
-    they hide nothing of the others, cast no occlusion on them, and go to the result with all that they have."""
+    """``fitted``: what a job works on, with the notes and files of the whole; ``kept``: meshes that
+    it leaves alone: they hide nothing of the others, cast no occlusion on them, and go to the
+    result with all that they have."""
 
     fitted: Asset
     kept: tuple[Mesh, ...] = ()
@@ -35,7 +36,8 @@ class Parts:
         return replace(result, meshes=(*result.meshes, *self.kept)) if self.kept else result
 
     def describe_kept(self, becomes: str) -> list[str]:
-        """Notes that name the kept meshes, or none without any. ``becomes``: what the job does with them."""
+        """Notes that name the kept meshes, or none without any. ``becomes``: what the job does with
+        them."""
         if not self.kept:
             return []
         out = []
@@ -48,8 +50,9 @@ class Parts:
 
 
 def split(asset: Asset, name: str, job: str, by_light: bool = True) -> Parts:
-    """What a job works on, and what it keeps (see ``alpha.kept_apart``). Raises InputError if nothing is left to fit.
-    ``name`` of the asset, and what the ``job`` does to it, for the message."""
+    """What a job works on, and what it keeps (see ``alpha.kept_apart``). Raises InputError if
+    nothing is left to fit. ``name`` of the asset, and what the ``job`` does to it, for the
+    message."""
     asset = separate_opaque(asset)
     apart = kept_apart(asset, by_light)
     kept = tuple(m for m, out in zip(asset.meshes, apart, strict=True) if out)

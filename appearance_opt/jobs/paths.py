@@ -29,22 +29,25 @@ REPORT_FILES = ("report.html", "report.json", "view[0-9]*_*.png", "map_*.png")
 """Patterns of the names in a report."""
 
 SUFFIX = "_M000_" + MAX_NAME * "x" + "_displacement.png"
-"""The longest that writers add to the stem of a result, about, where they name pictures after materials."""
+"""The longest that writers add to the stem of a result, about, where they name pictures after
+materials."""
 
 BYTES_PER_TRIANGLE, BYTES_PER_TEXEL = 150, 12
-"""Of a result: vertices, their attributes and indices as text or binary; four maps of three bytes, not compressed."""
+"""Of a result: vertices, their attributes and indices as text or binary; four maps of three bytes,
+not compressed."""
 
 STATE_BYTES_PER_TEXEL = 400
-"""Of a checkpoint: nine channels of a start, and of a fit value, two moments, mean and best value of each, twice while
-one state takes the place of another."""
+"""Of a checkpoint: nine channels of a start, and of a fit value, two moments, mean and best value
+of each, twice while one state takes the place of another."""
 
 REPORT_BYTES = 20 << 20
 
 
 @dataclass(frozen=True)
 class Outputs:
-    """All that a job writes. ``out``: the result, with what its writer puts beside it; ``levels``: tessellation levels
-    that are written beside it, too; ``report``, ``checkpoint``, ``textures``: folders."""
+    """All that a job writes. ``out``: the result, with what its writer puts beside it; ``levels``:
+    tessellation levels that are written beside it, too; ``report``, ``checkpoint``, ``textures``:
+    folders."""
 
     out: Path | None = None
     report: Path | None = None
@@ -107,12 +110,15 @@ class Outputs:
             check_folder(folder)
 
     def check_sources(self, *sources: object) -> None:
-        """Raise InputError if writing could replace a file that the user named (others than paths are passed over)."""
+        """Raise InputError if writing could replace a file that the user named (others than paths
+        are passed over)."""
         files = [Path(s) for s in sources if isinstance(s, (str, Path))]
         named = {file.resolve() for file in files}
         for path in self.results:
             if path.resolve() in named:
-                raise InputError(f"{path}: is the input itself, which is never changed; choose another name")
+                raise InputError(
+                    f"{path}: is the input itself, which is never changed; choose another name"
+                )
         self._check_files(files)
 
     def check_inputs(self, *assets: Asset | None) -> None:
@@ -124,14 +130,17 @@ class Outputs:
         for file in files:
             # a link would be replaced itself, not what it leads to
             for at in {file.parent.resolve() / file.name, file.resolve()}:
-                if any(at.parent == folder and fnmatchcase(at.name, name) for folder, name in patterns):
+                if any(
+                    at.parent == folder and fnmatchcase(at.name, name) for folder, name in patterns
+                ):
                     raise InputError(
                         f"{self.out or self.report}: writing it could replace '{file}', which the input refers to "
                         "and which is never changed; choose another name or folder"
                     )
 
     def check_room(self, triangles: int, options: CommonOptions | None) -> None:
-        """Raise InputError if a result of so many triangles would not fit on the disks, as far as can be told."""
+        """Raise InputError if a result of so many triangles would not fit on the disks, as far as
+        can be told."""
         texels = 0 if options is None else options.texture_size**2
         need: list[tuple[Path, int]] = [(Path(tempfile.gettempdir()), 3 * texels)]
         for path, level in zip(self.results, (0, *self.levels), strict=False):
@@ -147,7 +156,10 @@ class Outputs:
         for folder, size in need:
             there = next(p for p in (folder, *folder.resolve().parents) if p.exists())
             device = there.stat().st_dev
-            disks[device] = (disks.get(device, (there, 0))[0], disks.get(device, (there, 0))[1] + size)
+            disks[device] = (
+                disks.get(device, (there, 0))[0],
+                disks.get(device, (there, 0))[1] + size,
+            )
         for there, size in disks.values():
             free = shutil.disk_usage(there).free
             if size > free:
@@ -158,8 +170,8 @@ class Outputs:
 
     @contextmanager
     def held(self) -> Iterator[None]:
-        """While the job runs, no other run may write there. Raises InputError if one does. What a killed run has left
-        half done there is undone first."""
+        """While the job runs, no other run may write there. Raises InputError if one does. What a
+        killed run has left half done there is undone first."""
         with ExitStack() as stack:
             if self.out is not None:
                 stack.enter_context(locked(self.out.resolve()))
@@ -192,7 +204,8 @@ def _check_names(path: Path, names: list[str]) -> None:
 
 
 def _beside(out: Path) -> tuple[str, ...]:
-    """Patterns of the names that the writers of ``asset`` and ``jobs.displaced`` give to what lies beside ``out``."""
+    """Patterns of the names that the writers of ``asset`` and ``jobs.displaced`` give to what lies
+    beside ``out``."""
     stem = escape(out.stem)
     displacement = f"{stem}_displacement*.png"
     return {

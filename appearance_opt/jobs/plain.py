@@ -1,4 +1,5 @@
-"""Maps whose variation nobody sees become numbers: a fit leaves noise in the maps of what has one colour."""
+"""Maps whose variation nobody sees become numbers: a fit leaves noise in the maps of what has one
+colour."""
 
 from __future__ import annotations
 
@@ -30,15 +31,17 @@ if TYPE_CHECKING:
 Maps = dict[str, "NDArray[np.float32] | float"]
 
 STEP = 1 / 255
-"""What nobody sees: one step of 8 bits, in maps as they are stored and in pictures as they are shown."""
+"""What nobody sees: one step of 8 bits, in maps as they are stored and in pictures as they are
+shown."""
 
 NOISE = 12 * STEP
-"""Deviation from their mean up to which maps may be noise (99 % of the texels): pictures decide. What varies more
-is drawn for no such question."""
+"""Deviation from their mean up to which maps may be noise (99 % of the texels): pictures decide.
+What varies more is drawn for no such question."""
 
 LOSS = 0.03
-"""dB that a result may lose, in the eyes of held-out views, by the colours of something that has one colour becoming a
-number. A grey ball of 1,000 triangles (33.7 dB after 120 steps, 512 texels) loses 0.0075 by those of its base colour,
+"""dB that a result may lose, in the eyes of held-out views, by the colours of something that has
+one colour becoming a number. A grey ball of 1,000 triangles (33.7 dB after 120 steps, 512 texels)
+loses 0.0075 by those of its base colour,
 0.001 and 0.004 by those of roughness and metalness, although single pixels change by up to 6, 2 and 2 steps (99 % of
 them by 1.3, 0.4 and 0.4)."""
 
@@ -57,7 +60,11 @@ def flatten_maps(
     options: CommonOptions,
 ) -> Maps:
     """The ``maps`` of a fitted model as they are to be written: see ``replace_constant``."""
-    judge = None if model.codec is None else Pictures(model, reference, sampler, min(options.resolution, 256))
+    judge = (
+        None
+        if model.codec is None
+        else Pictures(model, reference, sampler, min(options.resolution, 256))
+    )
     return replace_constant(maps, start.known, judge, start.maps)
 
 
@@ -67,11 +74,13 @@ class Judge(Protocol):
     channels: tuple[str, ...]
 
     def change(self, maps: Maps) -> float:
-        """Largest difference of display values, in [0, 1], from pictures with the maps as they were."""
+        """Largest difference of display values, in [0, 1], from pictures with the maps as they
+        were."""
         ...
 
     def loss(self, maps: Maps) -> float:
-        """dB by which pictures come off worse against the original's than with the maps as they were."""
+        """dB by which pictures come off worse against the original's than with the maps as they
+        were."""
         ...
 
 
@@ -81,14 +90,15 @@ def replace_constant(
     judge: Judge | None = None,
     start: Mapping[str, NDArray | float] | None = None,
 ) -> Maps:
-    """``maps`` with numbers instead of images for every group of channels that is constant; no normals instead of flat
-    ones.
+    """``maps`` with numbers instead of images for every group of channels that is constant; no
+    normals instead of flat ones.
 
-    A group is constant if no texel, encoded as it is stored, lies farther than ``STEP`` from its mean. Pictures may
-    tell, too, where ``judge`` draws them: if none changes by more than ``STEP``, by all such groups together; or, for a
-    group that is constant in ``start``, the maps of the original, if they lose no more than ``LOSS``: what a fit added
-    to it is noise. ``known`` (N, N): texels that belong to triangles; others do not count. Means are of
-    linear values; of a normal map it is the unbent normal.
+    A group is constant if no texel, encoded as it is stored, lies farther than ``STEP`` from its
+    mean. Pictures may tell, too, where ``judge`` draws them: if none changes by more than ``STEP``,
+    by all such groups together; or, for a group that is constant in ``start``, the maps of the
+    original, if they lose no more than ``LOSS``: what a fit added to it is noise. ``known`` (N, N):
+    texels that belong to triangles; others do not count. Means are of linear values; of a normal
+    map it is the unbent normal.
     """
     out, noisy = dict(maps), []
     for group in GROUPS:
@@ -97,7 +107,11 @@ def replace_constant(
         numbers, off = _deviation(group, out, known)
         if off.max() <= STEP:
             out |= numbers
-        elif judge is not None and set(group) <= set(judge.channels) and np.quantile(off, 0.99) <= NOISE:
+        elif (
+            judge is not None
+            and set(group) <= set(judge.channels)
+            and np.quantile(off, 0.99) <= NOISE
+        ):
             noisy.append((numbers, start is not None and _is_constant(group, start, known)))
     together = {n: v for numbers, _ in noisy for n, v in numbers.items()}
     trials = [(together, all(plain for _, plain in noisy)), *noisy] if len(noisy) > 1 else noisy
@@ -113,7 +127,9 @@ def replace_constant(
     return out
 
 
-def _is_constant(group: Sequence[str], maps: Mapping[str, NDArray | float], known: NDArray[np.bool_]) -> bool:
+def _is_constant(
+    group: Sequence[str], maps: Mapping[str, NDArray | float], known: NDArray[np.bool_]
+) -> bool:
     if not all(np.ndim(maps.get(n, 0.0)) for n in group):
         return all(n in maps for n in group)
     return bool(_deviation(group, maps, known)[1].max() <= STEP)
@@ -122,13 +138,18 @@ def _is_constant(group: Sequence[str], maps: Mapping[str, NDArray | float], know
 def _deviation(
     group: Sequence[str], maps: Mapping[str, NDArray | float], known: NDArray[np.bool_]
 ) -> tuple[dict[str, float], NDArray[np.float32]]:
-    """(the constant of each channel by name, (K,) how far the texels that count lie from it as they are stored)."""
+    """(the constant of each channel by name, (K,) how far the texels that count lie from it as they
+    are stored)."""
     values = np.stack([np.asarray(maps[n], np.float32) for n in group], axis=-1)
     counted = known.any() and known.shape == values.shape[:2]
     seen = values[known] if counted else values.reshape(-1, len(group))
     mean = np.array([0, 0, 1]) if group == NORMALS else seen.mean(axis=0, dtype=np.float64)
-    most = max(float(seen.max(initial=0.0)), 1e-12) if group == EMISSION else 1.0  # emission is in units of its factor
-    off = np.abs(_stored(group, seen / most) - _stored(group, mean[None].astype(np.float32) / most)).max(axis=1)
+    most = (
+        max(float(seen.max(initial=0.0)), 1e-12) if group == EMISSION else 1.0
+    )  # emission is in units of its factor
+    off = np.abs(
+        _stored(group, seen / most) - _stored(group, mean[None].astype(np.float32) / most)
+    ).max(axis=1)
     return dict(zip(group, mean.tolist(), strict=True)), off
 
 
@@ -142,7 +163,9 @@ def _stored(group: Sequence[str], values: NDArray[np.float32]) -> NDArray[np.flo
 class Pictures:
     """A ``Judge`` that draws a model, which has fitted maps, in views that its fit has not seen."""
 
-    def __init__(self, model: Model, reference: Reference, sampler: ViewSampler, resolution: int) -> None:
+    def __init__(
+        self, model: Model, reference: Reference, sampler: ViewSampler, resolution: int
+    ) -> None:
         assert model.codec is not None
         self._model, self._codec, self.channels = model, model.codec, model.codec.channels
         self._reference, self._resolution = reference, resolution

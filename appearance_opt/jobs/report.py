@@ -66,7 +66,9 @@ def _level_metrics(
     views = sampler.held_out(MEASURED).draw(0, VIEWS)
     reference = render_asset(placement.local(source), views, RESOLUTION, SAMPLES)
     return {
-        f"level {k}": compare_images(reference, render_asset(placement.local(a), views, RESOLUTION, SAMPLES))
+        f"level {k}": compare_images(
+            reference, render_asset(placement.local(a), views, RESOLUTION, SAMPLES)
+        )
         for k, a in sorted(result.tessellated.items())[:-1]
     }
 
@@ -90,7 +92,9 @@ def write_bake_report(
         "seconds by stage": ", ".join(f"{k} {v:.1f}" for k, v in result.seconds.items()),
     }
     if fit is not None:
-        facts["steps"] = f"{fit.steps} ({fit.steps / max(fit.seconds, 1e-9):.1f} per second), best at {fit.best_step}"
+        facts["steps"] = (
+            f"{fit.steps} ({fit.steps / max(fit.seconds, 1e-9):.1f} per second), best at {fit.best_step}"
+        )
     maps = pictures.texture_pictures(result.asset)
     maps["coverage (red: missed)"] = coverage_picture(result.covered, result.missed)
     data = ReportData(
@@ -113,11 +117,17 @@ def _measure(
     sampler: ViewSampler,
     placement: Placement,
 ) -> tuple[dict[str, Metrics], list[dict[str, NDArray[np.uint8]]]]:
-    """(metrics of start and result, which ``names`` names, on held-out views of the source; pictures of some of
-    the views). One column is left out if the two are the same."""
+    """(metrics of start and result, which ``names`` names, on held-out views of the source;
+    pictures of some of the views). One column is left out if the two are the same."""
     views = sampler.held_out(MEASURED).draw(0, VIEWS)
-    reference, last = (render_asset(placement.local(a), views, RESOLUTION, SAMPLES) for a in (source, result))
-    first = last if start is result else render_asset(placement.local(start), views, RESOLUTION, SAMPLES)
+    reference, last = (
+        render_asset(placement.local(a), views, RESOLUTION, SAMPLES) for a in (source, result)
+    )
+    first = (
+        last
+        if start is result
+        else render_asset(placement.local(start), views, RESOLUTION, SAMPLES)
+    )
     triangles = triangle_images(placement.local(result), views[:PICTURED], 2 * RESOLUTION)
     metrics = {names[0]: compare_images(reference, first)}
     if start is not result:
@@ -137,7 +147,9 @@ def _measure(
     return metrics, per_view
 
 
-def write_compare_report(folder: Path, reference: Asset, candidate: Asset, result: Comparison) -> None:
+def write_compare_report(
+    folder: Path, reference: Asset, candidate: Asset, result: Comparison
+) -> None:
     """Report of a comparison."""
     per_view = []
     for r, c in zip(result.reference, result.candidate, strict=True):
@@ -145,7 +157,10 @@ def write_compare_report(folder: Path, reference: Asset, candidate: Asset, resul
         per_view.append({**shown, "difference x 4": pictures.difference(r, c)})
     data = ReportData(
         title=f"{candidate.name} against {reference.name}",
-        facts={"reference triangles": reference.triangle_count, "candidate triangles": candidate.triangle_count},
+        facts={
+            "reference triangles": reference.triangle_count,
+            "candidate triangles": candidate.triangle_count,
+        },
         metrics={"candidate": result.metrics},
         views=per_view,
         notes=[*reference.notes, *candidate.notes],

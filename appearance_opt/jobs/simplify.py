@@ -37,11 +37,12 @@ CHECKPOINT_SECONDS = 10.0
 
 @dataclass
 class SimplifyResult:
-    """What ``simplify`` did. ``asset``: the result, whose first mesh was fitted (the first two where some faces are
-    seen from one side and others from both); the others passed through: they have ``kept_triangles``, which
-    ``triangles`` and ``source_triangles`` do not count. ``start``: the same before the fit; ``tessellated``: with a
-    displacement map, the mesh as drawn at each level (and ``start`` at the finest one); ``fit``: curve and counts;
-    ``seconds``: wall-clock time by stage; ``notes``: what the user should know; ``error``: set when the fit diverged
+    """What ``simplify`` did. ``asset``: the result, whose first mesh was fitted (the first two
+    where some faces are seen from one side and others from both); the others passed through: they
+    have ``kept_triangles``, which ``triangles`` and ``source_triangles`` do not count. ``start``:
+    the same before the fit; ``tessellated``: with a displacement map, the mesh as drawn at each
+    level (and ``start`` at the finest one); ``fit``: curve and counts; ``seconds``: wall-clock time
+    by stage; ``notes``: what the user should know; ``error``: set when the fit diverged
     (``simplify`` raises it after writing the best state)."""
 
     asset: Asset
@@ -74,13 +75,15 @@ def simplify(
     began: float | None = None,
     inputs: Iterable[str | Path] = (),
 ) -> SimplifyResult:
-    """Simplify ``source`` (a path or an asset) and write the result to ``out`` (None: do not write).
+    """Simplify ``source`` (a path or an asset) and write the result to ``out`` (None: do not
+    write).
 
-    ``report``: folder for pictures, metrics and report.html. ``checkpoint``: folder in which the state is kept
-    every few seconds; with ``resume`` a run goes on from there. ``variants``: USD variant selections. ``began``:
-    ``time.perf_counter()`` at which the time budget began, if before this call. ``inputs``: other files that must not
-    be replaced. Transparent meshes of the source pass into the result as they are (see ``jobs.parts``). Ctrl-C ends the
-    fit early and still writes the best state so far, the third one gives it up; once the result is written it ends the
+    ``report``: folder for pictures, metrics and report.html. ``checkpoint``: folder in which the
+    state is kept every few seconds; with ``resume`` a run goes on from there. ``variants``: USD
+    variant selections. ``began``: ``time.perf_counter()`` at which the time budget began, if before
+    this call. ``inputs``: other files that must not be replaced. Transparent meshes of the source
+    pass into the result as they are (see ``jobs.parts``). Ctrl-C ends the fit early and still
+    writes the best state so far, the third one gives it up; once the result is written it ends the
     report. Raises AppearanceError.
     """
     from appearance_opt.jobs.fitting import Stopwatch
@@ -108,11 +111,15 @@ def _simplify(
 ) -> SimplifyResult:
     from appearance_opt.jobs.fitting import conclude
 
-    watch.begin(f"reading {Path(source).name}" if isinstance(source, (str, Path)) else "checking the asset")
+    watch.begin(
+        f"reading {Path(source).name}" if isinstance(source, (str, Path)) else "checking the asset"
+    )
     asset = load_source(source, options, variants)
     first = load_init(options)
     outputs.check_inputs(asset, first)
-    outputs.check_room(options.triangles or round((options.ratio or 1.0) * asset.triangle_count), options)
+    outputs.check_room(
+        options.triangles or round((options.ratio or 1.0) * asset.triangle_count), options
+    )
     parts = split(asset, str(source) if isinstance(source, (str, Path)) else asset.name, "simplify")
     watch.lap("load")
     backend.select(options.device)
@@ -122,7 +129,9 @@ def _simplify(
 
         job = fingerprint(options, asset, first)
         checkpointer = Checkpointer(outputs.checkpoint, job, resume, CHECKPOINT_SECONDS)
-    run = _Job(parts, first, options, watch, progress, checkpointer, interrupts, outputs.report is not None)
+    run = _Job(
+        parts, first, options, watch, progress, checkpointer, interrupts, outputs.report is not None
+    )
     result = run.fit()
     if outputs.out is not None:
         watch.begin("writing the result")
@@ -163,7 +172,9 @@ def write_result(result: SimplifyResult, out: Path, options: CommonOptions) -> N
                 write(asset, together.place(level_path(out, level)))
 
 
-def load_source(source: str | Path | Asset, options: CommonOptions, variants: dict[str, str] | None = None) -> Asset:
+def load_source(
+    source: str | Path | Asset, options: CommonOptions, variants: dict[str, str] | None = None
+) -> Asset:
     """``source`` itself, or the file of that name, read as the options say."""
     if not isinstance(source, (str, Path)):
         return source
@@ -172,10 +183,17 @@ def load_source(source: str | Path | Asset, options: CommonOptions, variants: di
 
 
 def load_init(options: SimplifyOptions) -> Asset | None:
-    """The asset that ``--init`` names; None if it names none. Its own maps are not used: it may lack them."""
+    """The asset that ``--init`` names; None if it names none. Its own maps are not used: it may
+    lack them."""
     if not Path(options.init).suffix:
         return None
-    return load(options.init, refine=options.refine, missing_textures="ignore", root=options.root, keep_layout=True)
+    return load(
+        options.init,
+        refine=options.refine,
+        missing_textures="ignore",
+        root=options.root,
+        keep_layout=True,
+    )
 
 
 class _Job:
@@ -194,7 +212,13 @@ class _Job:
     ) -> None:
         from appearance_opt.jobs.fitting import seconds_left
         from appearance_opt.jobs.growth import grow_start, mend_start
-        from appearance_opt.jobs.start import atlas_of, budget, inherit_sides, make_start, transfer_appearance
+        from appearance_opt.jobs.start import (
+            atlas_of,
+            budget,
+            inherit_sides,
+            make_start,
+            transfer_appearance,
+        )
         from appearance_opt.reference.mesh import MeshReference
 
         self.options, self.watch, self.interrupts = options, watch, interrupts
@@ -202,7 +226,9 @@ class _Job:
         self.parts, asset = parts, parts.fitted
         self.notes = [
             *asset.notes,
-            *parts.describe_kept("pass into the result as they are, and count for no --triangles or --ratio"),
+            *parts.describe_kept(
+                "pass into the result as they are, and count for no --triangles or --ratio"
+            ),
         ]
         watch.begin(f"preparing {asset.triangle_count:,} triangles")
         self.placement = Placement.around(asset.points())
@@ -218,11 +244,15 @@ class _Job:
             triangles = budget(options, asset.triangle_count)
             left = seconds_left(options, watch, with_report)
             self.start = self._make_start(
-                lambda: make_start(self.reference, options, self.sampler, triangles, left, watch.begin)
+                lambda: make_start(
+                    self.reference, options, self.sampler, triangles, left, watch.begin
+                )
             )
         else:
             assert first is not None
-            mesh, notes = atlas_of(first, self.placement, asset.triangle_count, options, self.reference.single)
+            mesh, notes = atlas_of(
+                first, self.placement, asset.triangle_count, options, self.reference.single
+            )
             self.notes += notes
             if options.relative is False and "shape" in options.fit and not options.displaced:
                 self.start = self._fit_shape(
@@ -231,7 +261,9 @@ class _Job:
                 # the shape has been let go of; the mended one is a likeness
                 self.options = with_values(self.options, relative=None)
             else:
-                self.start = self._make_start(lambda: transfer_appearance(self.reference, mesh, options))
+                self.start = self._make_start(
+                    lambda: transfer_appearance(self.reference, mesh, options)
+                )
         self.start = inherit_sides(self.start, self.reference.single)
         watch.lap("start")
 
@@ -256,7 +288,9 @@ class _Job:
         seconds = seconds_left(o, self.watch, self.with_report)
         steps = 1000 if o.steps is None and seconds is None else o.steps
         share = None if seconds is None else SHARE * seconds
-        effort = Effort(share, None if steps is None else round(SHARE * steps), self.progress, self.interrupts)
+        effort = Effort(
+            share, None if steps is None else round(SHARE * steps), self.progress, self.interrupts
+        )
 
         start, interrupted = self._make_or_resume(lambda: make_within(effort))
         if interrupted:  # Ctrl-C ends both fits
@@ -290,7 +324,9 @@ class _Job:
         asset = self.parts.fitted
         name = f"{asset.name}_{len(self.start.mesh.faces)}"
         exporter = Exporter(self.placement, asset.origin, name)
-        initial = Model(self.start.mesh, self.start.maps, frozenset(), Rates(), self.start.levels[-1:])
+        initial = Model(
+            self.start.mesh, self.start.maps, frozenset(), Rates(), self.start.levels[-1:]
+        )
         begin = exporter.drawn(initial, self.start.maps)[initial.level]
         maps = clean_maps(model, self.start.known)
         maps |= transfer_emission(self.reference, model.posed_mesh(), o.texture_size)
@@ -312,7 +348,7 @@ class _Job:
 
 
 def fingerprint(options: SimplifyOptions, asset: Asset, first: Asset | None) -> str:
-    """Hash of all that a result depends on: version, options, and everything that was read, but for where it was read
-    from and what was said about it. ``first``: the mesh of ``--init``."""
+    """Hash of all that a result depends on: version, options, and everything that was read, but for
+    where it was read from and what was said about it. ``first``: the mesh of ``--init``."""
     read = [None if a is None else replace(a, files=(), notes=()) for a in (asset, first)]
     return digest([__version__, options, *read])

@@ -20,7 +20,14 @@ from appearance_opt.initial.sphere import SMALLEST as SMALLEST_SPHERE
 from appearance_opt.initial.sphere import random_maps, sphere
 from appearance_opt.initial.transfer import transfer
 from appearance_opt.initial.visibility import importance, pixel_counts
-from appearance_opt.jobs.displaced import REACH, bake_displacement, flat_map, gutter, median_edge, require_memory
+from appearance_opt.jobs.displaced import (
+    REACH,
+    bake_displacement,
+    flat_map,
+    gutter,
+    median_edge,
+    require_memory,
+)
 from appearance_opt.jobs.parts import split
 from appearance_opt.latent.displacement import DISPLACEMENT
 from appearance_opt.latent.latent import LatentMesh
@@ -45,38 +52,41 @@ log = logging.getLogger(__name__)
 VISIBILITY_VIEWS = 160
 
 REALLOCATION_SHARE = 0.4
-"""Part of the time left after the first start that moving triangles may take. Where steps are slow they are worth
-more: on a machine at a third of its usual speed the demo's urn ended at 23.79 dB with a round, which took 28 of the 47
-seconds left, and at 24.26 without."""
+"""Part of the time left after the first start that moving triangles may take. Where steps are slow
+they are worth more: on a machine at a third of its usual speed the demo's urn ended at 23.79 dB
+with a round, which took 28 of the 47 seconds left, and at 24.26 without."""
 
 REALLOCATION_EXTRA = 1.5
-"""What moving triangles takes apart from its rounds, in first starts: images of the reference, and the spread of the
-texels. 1.4 for the demo's urn and chess_king."""
+"""What moving triangles takes apart from its rounds, in first starts: images of the reference, and
+the spread of the texels. 1.4 for the demo's urn and chess_king."""
 
 WORTHWHILE = 0.98
-"""Error of a start with moved triangles, relative to the one before, up to which it takes its place. What is gained by
-less lies within chance: starts of spot and chess_king at 1.5 % with an error 1.6 % smaller were 0.25 and 0.54 dB worse
-in the eyes of another renderer; one of chess_king at 5 % with an error 2.3 % smaller was 0.54 dB better."""
+"""Error of a start with moved triangles, relative to the one before, up to which it takes its
+place. What is gained by less lies within chance: starts of spot and chess_king at 1.5 % with an
+error 1.6 % smaller were 0.25 and 0.54 dB worse in the eyes of another renderer; one of chess_king
+at 5 % with an error 2.3 % smaller was 0.54 dB better."""
 
 SECONDS_PER_FACE, COARSE_SHARE = 2e-5, 0.25
-"""What decimation takes per face of the reference (1.4e-5 on a machine of today, more on others), and the part of a
-time budget from which it begins with a coarse round (see ``clustering``). The same on every machine, so that the same
-options make the same start."""
+"""What decimation takes per face of the reference (1.4e-5 on a machine of today, more on others),
+and the part of a time budget from which it begins with a coarse round (see ``clustering``). The
+same on every machine, so that the same options make the same start."""
 
 CLUSTERS, LEAST_CLUSTERS = 40, 100_000
 """Vertices that a coarse round leaves, per triangle that is asked for, and at the least."""
 
 TIGHT_TRIANGLES = 10_000
-"""Largest mesh whose atlas is packed by trying every place: the time grows with the square of the charts."""
+"""Largest mesh whose atlas is packed by trying every place: the time grows with the square of the
+charts."""
 
 
 @dataclass(frozen=True)
 class Start:
     """``maps``: channel name -> image or number; ``relative``: may the Laplacian keep this shape?
-    ``known``: texels whose values mean something. ``levels``: tessellation levels at which it is drawn;
-    ``finest``: the displaced mesh of the finest one, None without displacement. ``grown``: was it found by fitting
-    (from a sphere)? ``charts``: the mesh with its charts as they were before they were packed, if they were kept.
-    ``notes``: what the user should know of how it was made."""
+    ``known``: texels whose values mean something. ``levels``: tessellation levels at which it is
+    drawn; ``finest``: the displaced mesh of the finest one, None without displacement. ``grown``:
+    was it found by fitting (from a sphere)? ``charts``: the mesh with its charts as they were
+    before they were packed, if they were kept. ``notes``: what the user should know of how it was
+    made."""
 
     mesh: LatentMesh
     maps: dict[str, NDArray | float]
@@ -95,14 +105,16 @@ class Start:
 
 
 def budget(options: SimplifyOptions, available: int) -> int:
-    """Triangles asked for. Raises InputError when the input has fewer, or when their tessellation does not fit
-    into memory."""
+    """Triangles asked for. Raises InputError when the input has fewer, or when their tessellation
+    does not fit into memory."""
     count = options.triangles
     if count is None:
         assert options.ratio is not None
         count = min(max(4, round(options.ratio * available)), available)
     if count > available:
-        raise InputError(f"--triangles {count}: the input has only {available} triangles; ask for fewer")
+        raise InputError(
+            f"--triangles {count}: the input has only {available} triangles; ask for fewer"
+        )
     require_memory(count, options)
     return count
 
@@ -115,17 +127,28 @@ def make_start(
     seconds: float | None = None,
     tell: Callable[[str], None] = lambda _: None,
 ) -> Start:
-    """Sphere, or decimated reference. ``seconds``: what is left for start and fit (None: no limit). ``tell``: called
-    with what begins, in a few words."""
+    """Sphere, or decimated reference. ``seconds``: what is left for start and fit (None: no limit).
+    ``tell``: called with what begins, in a few words."""
     size = options.texture_size
     if options.init == "sphere":
         if triangles < SMALLEST_SPHERE:
-            raise InputError(f"--init sphere needs at least {SMALLEST_SPHERE} triangles, not {triangles}")
+            raise InputError(
+                f"--init sphere needs at least {SMALLEST_SPHERE} triangles, not {triangles}"
+            )
         mesh = sphere(triangles, sampler.centre, 0.6 * sampler.radius, size)
-        maps = select_told(reference, random_maps(size, options.seed, options.normal_map and "normal" in options.fit))
+        maps = select_told(
+            reference,
+            random_maps(size, options.seed, options.normal_map and "normal" in options.fit),
+        )
         known = np.zeros((size, size), bool)
         if options.displaced:
-            return Start(mesh, {**maps, DISPLACEMENT: flat_map(mesh, options)}, False, known, options.levels())
+            return Start(
+                mesh,
+                {**maps, DISPLACEMENT: flat_map(mesh, options)},
+                False,
+                known,
+                options.levels(),
+            )
         return Start(mesh, {**maps}, False, known)
     starts = _Decimated(reference, options, sampler, triangles, tell)
     began = time.perf_counter()
@@ -145,25 +168,30 @@ def make_start(
 
 
 def affordable(rounds: int, taken: float, left: float | None) -> int:
-    """Rounds of reallocation, of those asked for, that leave most of the time that is ``left`` to the fit when
-    one takes about as long as the first start has ``taken``, and all of them ``REALLOCATION_EXTRA`` times as long
-    besides. Both in seconds; None: no limit."""
+    """Rounds of reallocation, of those asked for, that leave most of the time that is ``left`` to
+    the fit when one takes about as long as the first start has ``taken``, and all of them
+    ``REALLOCATION_EXTRA`` times as long besides. Both in seconds; None: no limit."""
     if left is None or taken <= 0:
         return rounds
     return min(rounds, max(int(REALLOCATION_SHARE * left / taken - REALLOCATION_EXTRA), 0))
 
 
 def is_coarse(faces: int, vertices: int, clusters: int, budget: float | None) -> bool:
-    """Does decimation of a mesh begin with a coarse round? If it would take much of the time budget (seconds), and if
-    that leaves half of the vertices at the most."""
-    return budget is not None and SECONDS_PER_FACE * faces > COARSE_SHARE * budget and 2 * clusters < vertices
+    """Does decimation of a mesh begin with a coarse round? If it would take much of the time budget
+    (seconds), and if that leaves half of the vertices at the most."""
+    return (
+        budget is not None
+        and SECONDS_PER_FACE * faces > COARSE_SHARE * budget
+        and 2 * clusters < vertices
+    )
 
 
 class _Decimated:
-    """Starts from the reference with fewer triangles. ``coarse``: is it clustered first, as it is too large for the
-    time budget? ``positions``, ``faces``, ``single``: what is decimated, the reference's or the clusters'; ``weight``:
-    importance of these faces by how much is seen of them; ``visible``: those that are decimated at all; ``views``:
-    views that neither the fit nor its validation uses."""
+    """Starts from the reference with fewer triangles. ``coarse``: is it clustered first, as it is
+    too large for the time budget? ``positions``, ``faces``, ``single``: what is decimated, the
+    reference's or the clusters'; ``weight``: importance of these faces by how much is seen of them;
+    ``visible``: those that are decimated at all; ``views``: views that neither the fit nor its
+    validation uses."""
 
     positions: NDArray
     faces: NDArray
@@ -187,7 +215,9 @@ class _Decimated:
             tell("clustering vertices")
             self.positions, self.faces, source = cluster(merged.positions, merged.faces, clusters)
             self.single = reference.single[source]
-            scene = upload.scene_of(self.positions, self.faces, culled(self.positions, self.faces, self.single))
+            scene = upload.scene_of(
+                self.positions, self.faces, culled(self.positions, self.faces, self.single)
+            )
         count = len(self.faces)
         self.weight, self.visible = np.ones(count), np.ones(count, bool)
         if not options.keep_hidden:
@@ -210,17 +240,25 @@ class _Decimated:
         if not len(faces):
             raise InputError("nothing is left of this mesh at that budget; ask for more triangles")
         self.tell(f"unwrapping {len(faces):,} triangles")
-        return self._pack_and_bake(make_charts(positions, faces, single[source]), np.ones(len(faces)), False)
+        return self._pack_and_bake(
+            make_charts(positions, faces, single[source]), np.ones(len(faces)), False
+        )
 
     def move_triangles(self, start: Start, judge: StartError, rounds: int) -> tuple[Start, float]:
-        """The best of a start and those with triangles moved to where its image error is, and its error."""
+        """The best of a start and those with triangles moved to where its image error is, and its
+        error."""
         merged, weight = self.reference.merged, self.weight
         best, (error, by_face) = start, judge.measure(start.drawn, start.maps)
         for number in range(1, rounds + 1):
             weight = weight * weights(merged.positions, merged.faces, by_face, self.visible)
             candidate = self.decimate(weight)
             again, by_face = judge.measure(candidate.drawn, candidate.maps)
-            log.info("triangles moved, round %d: squared error of the start %.3g -> %.3g", number, error, again)
+            log.info(
+                "triangles moved, round %d: squared error of the start %.3g -> %.3g",
+                number,
+                error,
+                again,
+            )
             if again < WORTHWHILE * error:
                 best, error = candidate, again
         return best, error
@@ -230,7 +268,8 @@ class _Decimated:
         ``tight``: see ``pack_charts``."""
         assert start.charts is not None
         scale = np.ones(len(start.mesh.faces))
-        # displaced vertices read the rim of a chart on both of its sides, which asks for the same texels everywhere
+        # displaced vertices read the rim of a chart on both of its sides, which asks for the same
+        # texels everywhere
         if not self.options.displaced:
             scale = chart_scales(start.mesh, start.maps, self.views)
         return self._pack_and_bake(start.charts, scale, tight)
@@ -238,36 +277,62 @@ class _Decimated:
     def _pack_and_bake(self, charts: LatentMesh, scale: NDArray, tight: bool) -> Start:
         options = self.options
         self.tell("packing the atlas and baking its maps")
-        mesh = pack_charts(charts, scale, options.texture_size, gutter(len(charts.faces), options), tight)
+        mesh = pack_charts(
+            charts, scale, options.texture_size, gutter(len(charts.faces), options), tight
+        )
         return replace(transfer_appearance(self.reference, mesh, options), charts=charts)
 
 
-def select_told(reference: Reference, maps: Mapping[str, NDArray | float]) -> dict[str, NDArray | float]:
-    """Those of a start's maps that images of the reference tell of: where it is not lit, colours alone."""
+def select_told(
+    reference: Reference, maps: Mapping[str, NDArray | float]
+) -> dict[str, NDArray | float]:
+    """Those of a start's maps that images of the reference tell of: where it is not lit, colours
+    alone."""
     unlit = isinstance(reference, MeshReference) and reference.unlit
     return {**{n: maps[n] for n in COLORS}, UNLIT: 1.0} if unlit else dict(maps)
 
 
-def transfer_appearance(reference: MeshReference, mesh: LatentMesh, options: SimplifyOptions) -> Start:
+def transfer_appearance(
+    reference: MeshReference, mesh: LatentMesh, options: SimplifyOptions
+) -> Start:
     """A mesh with the reference's appearance in its maps."""
     finest = None
     displacement: dict[str, NDArray] = {}
     if options.displaced:
-        finest, displacement = bake_displacement(reference, mesh, options, REACH * median_edge(mesh))
-    result = transfer(reference, mesh if finest is None else finest, options.texture_size, not options.keep_hidden)
+        finest, displacement = bake_displacement(
+            reference, mesh, options, REACH * median_edge(mesh)
+        )
+    result = transfer(
+        reference, mesh if finest is None else finest, options.texture_size, not options.keep_hidden
+    )
     missed = result.missed.sum() / max(result.covered.sum(), 1)
     if missed > 0.01:
-        log.warning("the transfer found no reference point for %.1f %% of the texels; they were filled", 100 * missed)
-    maps = {n: v for n, v in result.maps.items() if options.normal_map or not n.startswith("normal")}
-    return Start(mesh, {**select_told(reference, maps), **displacement}, True, result.covered, options.levels(), finest)
+        log.warning(
+            "the transfer found no reference point for %.1f %% of the texels; they were filled",
+            100 * missed,
+        )
+    maps = {
+        n: v for n, v in result.maps.items() if options.normal_map or not n.startswith("normal")
+    }
+    return Start(
+        mesh,
+        {**select_told(reference, maps), **displacement},
+        True,
+        result.covered,
+        options.levels(),
+        finest,
+    )
 
 
 def inherit_sides(start: Start, single: NDArray[np.bool_]) -> Start:
-    """A start whose triangles stem from none of the reference's, of which those in ``single`` are seen from their front
-    only: so are all of its triangles if all of these are."""
+    """A start whose triangles stem from none of the reference's, of which those in ``single`` are
+    seen from their front only: so are all of its triangles if all of these are."""
     if start.mesh.single is not None or not single.all():
         return start
-    meshes = (None if m is None else replace(m, single=np.ones(len(m.faces), bool)) for m in (start.mesh, start.finest))
+    meshes = (
+        None if m is None else replace(m, single=np.ones(len(m.faces), bool))
+        for m in (start.mesh, start.finest)
+    )
     mesh, finest = meshes
     assert mesh is not None
     return replace(start, mesh=mesh, finest=finest)
@@ -281,17 +346,22 @@ def atlas_of(
     sides: NDArray[np.bool_],
 ) -> tuple[LatentMesh, list[str]]:
     """(the mesh that ``options.init`` names, moved to a ``placement``, with a new atlas; notes).
-    ``available``: triangles of the reference; ``sides``: those that are seen from their front only. If either all or
-    none are, so it is with the mesh; else its file decides. Transparent parts are left out, for those of the input pass
-    into the result. Raises InputError when it has more triangles than were asked for."""
+    ``available``: triangles of the reference; ``sides``: those that are seen from their front only.
+    If either all or none are, so it is with the mesh; else its file decides. Transparent parts are
+    left out, for those of the input pass into the result. Raises InputError when it has more
+    triangles than were asked for."""
     from appearance_opt.asset.normals import weld
     from appearance_opt.asset.sides import single_sided
 
     parts = split(given, f"--init {options.init}", "start from", by_light=False)
     asset = parts.fitted
-    most = None if options.triangles is None and options.ratio is None else budget(options, available)
+    most = (
+        None if options.triangles is None and options.ratio is None else budget(options, available)
+    )
     if most is not None and asset.triangle_count > most:
-        raise InputError(f"--init {options.init}: has {asset.triangle_count} triangles, more than the {most} asked for")
+        raise InputError(
+            f"--init {options.init}: has {asset.triangle_count} triangles, more than the {most} asked for"
+        )
     offsets = np.cumsum([0] + [len(m.positions) for m in asset.meshes[:-1]])
     p = np.concatenate([m.positions for m in asset.meshes]).astype(np.float64)
     f = np.concatenate([m.faces + o for m, o in zip(asset.meshes, offsets, strict=True)])
@@ -308,4 +378,6 @@ def atlas_of(
         gutter(len(faces), options),
         single,
     )
-    return mesh, parts.describe_kept("of --init are left out: those of the input pass into the result")
+    return mesh, parts.describe_kept(
+        "of --init are left out: those of the input pass into the result"
+    )

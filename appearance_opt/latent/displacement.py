@@ -1,8 +1,10 @@
-"""The tessellated, displaced mesh: v_i^d = v_i + tex2d(t_i) n_i (Hasselgren et al. 2021, equation 3).
+"""The tessellated, displaced mesh: v_i^d = v_i + tex2d(t_i) n_i (Hasselgren et al. 2021, equation
+3).
 
-v_i and n_i are position and unit normal interpolated from the base mesh, whose vertices may move; tex2d is a
-scalar map in the units of the positions. A vertex on a UV seam has several texture coordinates t_i: its
-displacement is the mean of their lookups, so that it stays one vertex and no seam can open.
+v_i and n_i are position and unit normal interpolated from the base mesh, whose vertices may move;
+tex2d is a scalar map in the units of the positions. A vertex on a UV seam has several texture
+coordinates t_i: its displacement is the mean of their lookups, so that it stays one vertex and no
+seam can open.
 """
 
 from __future__ import annotations
@@ -31,15 +33,17 @@ class Tessellator:
     """From base positions and a displacement map to the positions of one tessellation level.
 
     ``topology``: connectivity of the tessellated mesh, which makes normals and tangent bases of the
-    displaced surface. All else is precomputed: base vertices and weights of each vertex, where it reads
-    the map and how finely.
+    displaced surface. All else is precomputed: base vertices and weights of each vertex, where it
+    reads the map and how finely.
     """
 
     def __init__(self, base: LatentMesh, level: int, tangents: bool) -> None:
         fine = tessellate(base, level)
         self.topology = LatentTopology(fine.mesh, tangents)
         self._base = corners_of(base)
-        self._parents = [mi.UInt32(np.ascontiguousarray(fine.parents[:, k], np.uint32)) for k in range(3)]
+        self._parents = [
+            mi.UInt32(np.ascontiguousarray(fine.parents[:, k], np.uint32)) for k in range(3)
+        ]
         self._weights = [mi.Float(np.ascontiguousarray(fine.weights[:, k])) for k in range(3)]
         self._uv = mi.Point2f(np.ascontiguousarray(fine.mesh.uvs.T))
         self._footprint = mi.Float(footprint(fine.mesh))
@@ -48,22 +52,30 @@ class Tessellator:
         dr.eval(self._parents, self._weights, self._uv, self._footprint, self._vertex, self._share)
 
     def __call__(self, positions: mi.Float, relief: TexelLayer | None) -> mi.Float:
-        """Flat positions (3 N) of the tessellated mesh from flat base positions (3 V) and the displacement
-        map; differentiable in the positions (also through the normals) and the map's texels."""
+        """Flat positions (3 N) of the tessellated mesh from flat base positions (3 V) and the
+        displacement map; differentiable in the positions (also through the normals) and the map's
+        texels."""
         if relief is None:
-            rows = [mi.ArrayXf(dr.gather(mi.Point3f, positions, i, mode=dr.ReduceMode.Expand)) for i in self._parents]
+            rows = [
+                mi.ArrayXf(dr.gather(mi.Point3f, positions, i, mode=dr.ReduceMode.Expand))
+                for i in self._parents
+            ]
             return dr.ravel(mi.Point3f(*self._mix(rows, 0)))
         base = mesh_ops.packed_vertices(positions, mesh_ops.vertex_normals(positions, self._base))
-        # Expand: hundreds of vertices hang on one base vertex, whose gradient atomics would serialise
+        # Expand: hundreds of vertices hang on one base vertex, whose gradient atomics would
+        # serialise
         rows = [
-            dr.gather(mi.ArrayXf, base, i, mode=dr.ReduceMode.Expand, shape=(8, dr.width(i))) for i in self._parents
+            dr.gather(mi.ArrayXf, base, i, mode=dr.ReduceMode.Expand, shape=(8, dr.width(i)))
+            for i in self._parents
         ]
         point, normal = mi.Point3f(*self._mix(rows, 0)), unit(mi.Vector3f(*self._mix(rows, 4)))
         return dr.ravel(point + normal * self.amount(relief))
 
     def amount(self, relief: TexelLayer) -> mi.Float:
         """Displacement (N) of each vertex: the mean of its render vertices' lookups."""
-        value = relief.pyramid.lookup(None, self._uv, self._footprint)[relief.channels.index(DISPLACEMENT)]
+        value = relief.pyramid.lookup(None, self._uv, self._footprint)[
+            relief.channels.index(DISPLACEMENT)
+        ]
         total = dr.zeros(mi.Float, len(self.topology.mesh.positions))
         dr.scatter_add(total, value * self._share, self._vertex)
         return total
@@ -71,24 +83,28 @@ class Tessellator:
     def _mix(self, rows: list[mi.ArrayXf], first: int) -> list[mi.Float]:
         """Three channels from ``first`` on, of the three parents by their weights."""
         w = self._weights
-        return [dr.fma(rows[0][c], w[0], dr.fma(rows[1][c], w[1], rows[2][c] * w[2])) for c in range(first, first + 3)]
+        return [
+            dr.fma(rows[0][c], w[0], dr.fma(rows[1][c], w[1], rows[2][c] * w[2]))
+            for c in range(first, first + 3)
+        ]
 
 
 def footprint(mesh: LatentMesh) -> NDArray[np.float32]:
-    """(R,) UV area that a render vertex stands for: the square of half the mean UV length of the edges of the
-    faces around it.
+    """(R,) UV area that a render vertex stands for: the square of half the mean UV length of the
+    edges of the faces around it.
 
-    A lookup with it reads the mip level at which a texel is half as long as an edge, and a bilinear one, whose weights
-    reach a texel far on both sides, averages over one edge in all: finer detail could not be held by this mesh, and
-    would alias. Texels as long as an edge average over two, which costs 1.4 dB on chess_king's start.
+    A lookup with it reads the mip level at which a texel is half as long as an edge, and a bilinear
+    one, whose weights reach a texel far on both sides, averages over one edge in all: finer detail
+    could not be held by this mesh, and would alias. Texels as long as an edge average over two,
+    which costs 1.4 dB on chess_king's start.
     """
     length, count = edges_around(mesh.uvs, mesh.frame_faces)
     return np.square(0.5 * length / np.maximum(count, 1)).astype(np.float32)
 
 
 def share(mesh: LatentMesh) -> NDArray[np.float32]:
-    """(R,) one over the number of render vertices of the same vertex, those counted that a face uses; 0 for
-    the others."""
+    """(R,) one over the number of render vertices of the same vertex, those counted that a face
+    uses; 0 for the others."""
     used = np.zeros(len(mesh.uvs), bool)
     used[mesh.frame_faces.ravel()] = True
     count = np.bincount(mesh.frame_vertex[used], minlength=len(mesh.positions))

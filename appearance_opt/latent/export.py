@@ -21,11 +21,13 @@ if TYPE_CHECKING:
     from appearance_opt.latent.latent import LatentMesh
 
 
-def to_asset(mesh: LatentMesh, positions: NDArray, maps: Mapping[str, NDArray | float], name: str) -> Asset:
-    """One mesh, one material; two, with the same textures, where some faces are seen from both sides and
-    others from their front only. ``positions`` (V, 3); ``maps``: natural values by channel name, images or
-    numbers. Normals are angle weighted and tangents MikkTSpace's: what the renderer of the fit uses, so
-    that the maps mean the same in another one."""
+def to_asset(
+    mesh: LatentMesh, positions: NDArray, maps: Mapping[str, NDArray | float], name: str
+) -> Asset:
+    """One mesh, one material; two, with the same textures, where some faces are seen from both
+    sides and others from their front only. ``positions`` (V, 3); ``maps``: natural values by
+    channel name, images or numbers. Normals are angle weighted and tangents MikkTSpace's: what the
+    renderer of the fit uses, so that the maps mean the same in another one."""
     p, tangents = positions[mesh.frame_vertex], None
     normals = summed_normals(positions, mesh.faces, welded=True)[mesh.frame_vertex]
     index, faces, n = split_where_cancelled(p, mesh.frame_faces, normals)
@@ -46,14 +48,16 @@ def to_asset(mesh: LatentMesh, positions: NDArray, maps: Mapping[str, NDArray | 
 
 
 def _by_side(mesh: Mesh, single: NDArray[np.bool_] | None) -> tuple[Mesh, ...]:
-    """A mesh whose material is double-sided, or what is so of it, and those of its faces (``single`` (F,)) that are
-    seen from their front only."""
+    """A mesh whose material is double-sided, or what is so of it, and those of its faces
+    (``single`` (F,)) that are seen from their front only."""
     if single is None or not single.any():
         return (mesh,)
     one_way = replace(mesh.material, double_sided=False)
     if single.all():
         return (replace(mesh, material=one_way),)
-    return _part(mesh, ~single), replace(_part(mesh, single), material=one_way, name=f"{mesh.name}_single_sided")
+    return _part(mesh, ~single), replace(
+        _part(mesh, single), material=one_way, name=f"{mesh.name}_single_sided"
+    )
 
 
 def _part(mesh: Mesh, faces: NDArray[np.bool_]) -> Mesh:
@@ -68,7 +72,9 @@ def _material(maps: Mapping[str, NDArray | float], name: str) -> Material:
     def stacked(*names: str) -> NDArray | None:
         values = [np.asarray(maps.get(n, 0.0), np.float32) for n in names]
         shapes = [v.shape for v in values if v.ndim]
-        return np.stack([np.broadcast_to(v, shapes[0]) for v in values], axis=-1) if shapes else None
+        return (
+            np.stack([np.broadcast_to(v, shapes[0]) for v in values], axis=-1) if shapes else None
+        )
 
     def numbers(*names: str) -> tuple[float, float, float]:
         r, g, b = (float(maps.get(n, 0.0)) for n in names)
@@ -82,11 +88,15 @@ def _material(maps: Mapping[str, NDArray | float], name: str) -> Material:
     normal = stacked("normal_x", "normal_y", "normal_z")
     orm = None
     if rough_metal is not None:
-        orm = np.concatenate([np.ones((*rough_metal.shape[:2], 1), np.float32), rough_metal], axis=-1)
+        orm = np.concatenate(
+            [np.ones((*rough_metal.shape[:2], 1), np.float32), rough_metal], axis=-1
+        )
     if normal is not None:
         normal = normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-6)
     emitted = stacked(*EMISSION)
-    emission, emission_texture = pack_emission(emitted) if emitted is not None else (numbers(*EMISSION), None)
+    emission, emission_texture = (
+        pack_emission(emitted) if emitted is not None else (numbers(*EMISSION), None)
+    )
     color = tuple(constant(c) if base is None else 1.0 for c in ("red", "green", "blue"))
     clamp = ("clamp", "clamp")
     return Material(

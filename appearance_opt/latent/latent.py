@@ -28,12 +28,13 @@ if TYPE_CHECKING:
 class LatentMesh:
     """Host description of a latent: V welded vertices, F faces, and its atlas.
 
-    ``positions`` (V, 3); ``faces`` (F, 3) into them; ``frame_vertex`` (R,): the vertex of each render
-    vertex; ``frame_faces`` (F, 3) into the render vertices; ``uvs`` (R, 2). Render vertices are split at
-    UV seams and where the handedness of the mapping changes.
+    ``positions`` (V, 3); ``faces`` (F, 3) into them; ``frame_vertex`` (R,): the vertex of each
+    render vertex; ``frame_faces`` (F, 3) into the render vertices; ``uvs`` (R, 2). Render vertices
+    are split at UV seams and where the handedness of the mapping changes.
 
-    ``normals`` (V, 3), ``tangents`` (R, 4), given together: frames of a mesh that keeps its shape and its own
-    normals. Its vertices are then split at hard edges, too, and only texels can be fitted.
+    ``normals`` (V, 3), ``tangents`` (R, 4), given together: frames of a mesh that keeps its shape
+    and its own normals. Its vertices are then split at hard edges, too, and only texels can be
+    fitted.
 
     ``single`` (F,): faces that are seen from their front only; None: all are seen from both sides.
     """
@@ -49,8 +50,8 @@ class LatentMesh:
 
 
 class LatentTopology:
-    """Everything about a latent that never changes during a fit, precomputed once. ``culled`` (F,): faces that are not
-    to be seen from behind (see ``asset.sides``), None without any."""
+    """Everything about a latent that never changes during a fit, precomputed once. ``culled`` (F,):
+    faces that are not to be seen from behind (see ``asset.sides``), None without any."""
 
     def __init__(self, mesh: LatentMesh, tangents: bool) -> None:
         self.mesh = mesh
@@ -59,7 +60,9 @@ class LatentTopology:
         self.faces = upload.index_packets(mesh.faces)
         self.frame_faces = upload.index_packets(mesh.frame_faces)
         # silhouettes run along welded edges: a seam is none
-        self.welded_faces = mesh.faces if mesh.normals is None else weld_faces(mesh.positions, mesh.faces)
+        self.welded_faces = (
+            mesh.faces if mesh.normals is None else weld_faces(mesh.positions, mesh.faces)
+        )
         self.culled = culled(mesh.positions, mesh.faces, mesh.single)
         self._culled = None if self.culled is None else mi.Bool(self.culled)
         self.edges = edge_list(self.welded_faces, self.culled)
@@ -72,8 +75,8 @@ class LatentTopology:
         return walkable(self.edges, self.welded_faces)
 
     def surface(self, positions: mi.Float) -> Surface:
-        """Surface of flat positions (3 V); differentiable in them. A mesh with its own normals ignores
-        ``positions``: it does not move."""
+        """Surface of flat positions (3 V); differentiable in them. A mesh with its own normals
+        ignores ``positions``: it does not move."""
         if self._fixed is not None:
             return self._fixed
         normals = mesh_ops.vertex_normals(positions, self.corners)
@@ -81,11 +84,15 @@ class LatentTopology:
         uv = dr.unravel(mi.Point2f, self.corners.uvs)
         if self.tangents:
             t = mesh_ops.vertex_tangents(positions, normals, self.corners)
-            frames = mesh_ops.interleave(uv.x, uv.y, self.handedness, mi.Float(0), t.x, t.y, t.z, mi.Float(0))
+            frames = mesh_ops.interleave(
+                uv.x, uv.y, self.handedness, mi.Float(0), t.x, t.y, t.z, mi.Float(0)
+            )
         else:
             frames = self.corners.uvs
         dr.eval(vertices, frames)
-        return Surface(self.faces, vertices, self.frame_faces, frames, None, self.tangents, self._culled)
+        return Surface(
+            self.faces, vertices, self.frame_faces, frames, None, self.tangents, self._culled
+        )
 
     def scene(self) -> Scene:
         """The mesh where it was at first, for tracing rays."""
@@ -97,8 +104,12 @@ class LatentTopology:
         vertices = upload.packets(8, m.positions, np.zeros(len(m.positions)), m.normals)
         frames = self.corners.uvs
         if self.tangents:
-            frames = upload.packets(8, m.uvs, m.tangents[:, 3], np.zeros(len(m.uvs)), m.tangents[:, :3])
-        return Surface(self.faces, vertices, self.frame_faces, frames, None, self.tangents, self._culled)
+            frames = upload.packets(
+                8, m.uvs, m.tangents[:, 3], np.zeros(len(m.uvs)), m.tangents[:, :3]
+            )
+        return Surface(
+            self.faces, vertices, self.frame_faces, frames, None, self.tangents, self._culled
+        )
 
 
 def weld_faces(positions: NDArray, faces: NDArray) -> NDArray[np.intp]:
@@ -131,8 +142,8 @@ def handedness(mesh: LatentMesh) -> NDArray[np.float32]:
 
 
 def edges_around(points: NDArray, faces: NDArray) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Total length and number (V,) of the edges at each of the points (V, D), of all faces (F, 3) around it: an edge
-    counts once for each of its faces."""
+    """Total length and number (V,) of the edges at each of the points (V, D), of all faces (F, 3)
+    around it: an edge counts once for each of its faces."""
     length, count = np.zeros(len(points)), np.zeros(len(points), np.int64)
     for a, b in ((0, 1), (1, 2), (2, 0)):
         i, j = faces[:, a], faces[:, b]
@@ -144,8 +155,8 @@ def edges_around(points: NDArray, faces: NDArray) -> tuple[NDArray[np.float64], 
 
 
 def local_edge_length(positions: NDArray, faces: NDArray) -> NDArray[np.float32]:
-    """(V,) mean length of the edges at each vertex, of all faces around it, positive; the mesh's mean for vertices
-    without one."""
+    """(V,) mean length of the edges at each vertex, of all faces around it, positive; the mesh's
+    mean for vertices without one."""
     length, count = edges_around(positions, faces)
     used = count > 0
     mean = length[used].sum() / max(count[used].sum(), 1)

@@ -1,8 +1,8 @@
 """Differentiable operations on the latent mesh: normals and tangent bases of moving positions.
 
 Each is a pure function of flat device buffers. The definitions are those of the exporter and of the
-closed-form transfer (``asset.normals``, ``asset.tangents``): angle-weighted vertex normals (Thuermer and
-Wuethrich 1998) and MikkTSpace's tangents.
+closed-form transfer (``asset.normals``, ``asset.tangents``): angle-weighted vertex normals
+(Thuermer and Wuethrich 1998) and MikkTSpace's tangents.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ TINY = 1e-20
 @dataclass
 class Corners:
     """Fixed connectivity of F triangles over V welded vertices and R render vertices (split at UV
-    seams). ``vertex``: 3 index arrays of width F into the vertices; ``frame``: the same into the render
-    vertices; ``frame_vertex``: (R,) vertex of each render vertex; ``uvs``: (2 R,) flat."""
+    seams). ``vertex``: 3 index arrays of width F into the vertices; ``frame``: the same into the
+    render vertices; ``frame_vertex``: (R,) vertex of each render vertex; ``uvs``: (2 R,) flat."""
 
     vertex: tuple[mi.UInt32, mi.UInt32, mi.UInt32]
     frame: tuple[mi.UInt32, mi.UInt32, mi.UInt32]
@@ -31,8 +31,9 @@ class Corners:
 
 
 def vertex_normals(positions: mi.Float, corners: Corners) -> mi.Vector3f:
-    """Unit normals (V) of flat positions (3 V): face normals weighted by the corner's angle. Zero at a vertex
-    whose normals cancel, or that no face uses: there, the face's own is taken (``render.surface``)."""
+    """Unit normals (V) of flat positions (3 V): face normals weighted by the corner's angle. Zero
+    at a vertex whose normals cancel, or that no face uses: there, the face's own is taken
+    (``render.surface``)."""
     p = [dr.gather(mi.Point3f, positions, i) for i in corners.vertex]
     normal = unit(dr.cross(p[1] - p[0], p[2] - p[0]))
     total = dr.zeros(mi.Float, dr.width(positions))
@@ -45,8 +46,8 @@ def vertex_normals(positions: mi.Float, corners: Corners) -> mi.Vector3f:
 
 
 def vertex_tangents(positions: mi.Float, normals: mi.Vector3f, corners: Corners) -> mi.Vector3f:
-    """Unit tangents (R): per corner the direction of growing u, projected on the plane of the corner's
-    vertex normal, normalised, weighted by the angle in that plane (MikkTSpace)."""
+    """Unit tangents (R): per corner the direction of growing u, projected on the plane of the
+    corner's vertex normal, normalised, weighted by the angle in that plane (MikkTSpace)."""
     p = [dr.gather(mi.Point3f, positions, i) for i in corners.vertex]
     uv = [dr.gather(mi.Point2f, corners.uvs, i) for i in corners.frame]
     a, b = uv[1] - uv[0], uv[2] - uv[0]
@@ -64,12 +65,15 @@ def vertex_tangents(positions: mi.Float, normals: mi.Vector3f, corners: Corners)
         dr.scatter_add(weight, dr.detach(angle), corners.frame[k])
     n = dr.gather(mi.Vector3f, normals, corners.frame_vertex)
     n = dr.select(dr.squared_norm(n) > 0, n, mi.Vector3f(0, 0, 1))
-    fallback = dr.normalize(dr.cross(n, dr.select(dr.abs(n.x) < 0.9, mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0))))
+    fallback = dr.normalize(
+        dr.cross(n, dr.select(dr.abs(n.x) < 0.9, mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0)))
+    )
     return _direction(dr.unravel(mi.Vector3f, total), weight, fallback)
 
 
 def _direction(summed: mi.Vector3f, weight: mi.Float, fallback: mi.Vector3f) -> mi.Vector3f:
-    """Unit vector along a sum of unit vectors with the given total ``weight``; ``fallback`` where they cancel."""
+    """Unit vector along a sum of unit vectors with the given total ``weight``; ``fallback`` where
+    they cancel."""
     squared = dr.squared_norm(summed)
     ok = squared > dr.square(CANCELLED * weight)
     return dr.select(ok, summed * dr.rsqrt(dr.select(ok, squared, 1)), fallback)
@@ -77,7 +81,8 @@ def _direction(summed: mi.Vector3f, weight: mi.Float, fallback: mi.Vector3f) -> 
 
 def packed_vertices(positions: mi.Float, normals: mi.Vector3f) -> mi.Float:
     """Positions and normals of all vertices as packets (8 V): position, 0, normal, 0."""
-    # not dr.unravel: its derivative overwrites what other uses of the same positions have handed back
+    # not dr.unravel: its derivative overwrites what other uses of the same positions have handed
+    # back
     p = dr.gather(mi.Point3f, positions, dr.arange(mi.UInt32, dr.width(positions) // 3))
     return interleave(p.x, p.y, p.z, mi.Float(0), normals.x, normals.y, normals.z, mi.Float(0))
 
@@ -92,7 +97,7 @@ def _in_plane(v: mi.Vector3f, n: mi.Vector3f) -> mi.Vector3f:
 
 
 def _angle(a: mi.Vector3f, b: mi.Vector3f) -> mi.Float:
-    """Angle between vectors, as exact for thin corners as for wide ones (the arc cosine loses half of its digits
-    there), with a finite derivative for parallel ones."""
+    """Angle between vectors, as exact for thin corners as for wide ones (the arc cosine loses half
+    of its digits there), with a finite derivative for parallel ones."""
     sine = dr.sqrt(at_least(dr.squared_norm(dr.cross(a, b)), 1e-16))
     return angle_of(sine, dr.dot(a, b))

@@ -16,8 +16,8 @@ class Parameter:
     """One fitted quantity: a flat device array of packets of ``channels`` floats.
 
     ``rate``: learning rates, one per channel (``channels`` values) or one per element (as wide as
-    ``value``). ``low``, ``high``: bounds per channel, or None. ``smooth``: a symmetric linear map that
-    preconditions its steps (see ``fit.smoothing``), or None.
+    ``value``). ``low``, ``high``: bounds per channel, or None. ``smooth``: a symmetric linear map
+    that preconditions its steps (see ``fit.smoothing``), or None.
     """
 
     name: str

@@ -1,9 +1,10 @@
 """Edge-midpoint subdivision of a latent mesh: topology once, on the host.
 
-Every triangle becomes four. A new vertex is the mean of its two parents, so after any number of levels each
-vertex is a fixed combination of at most three base vertices, with weights that are multiples of 2^-level
-(exact in floating point). Positions and normals of all levels therefore follow from the base mesh in one
-gather (see ``displacement``); nothing is refined level by level during a fit.
+Every triangle becomes four. A new vertex is the mean of its two parents, so after any number of
+levels each vertex is a fixed combination of at most three base vertices, with weights that are
+multiples of 2^-level (exact in floating point). Positions and normals of all levels therefore
+follow from the base mesh in one gather (see ``displacement``); nothing is refined level by level
+during a fit.
 """
 
 from __future__ import annotations
@@ -24,9 +25,9 @@ MAX_LEVEL = 4
 class Tessellation:
     """A latent mesh of F triangles after ``level`` subdivisions.
 
-    ``mesh``: F 4^level triangles over N welded vertices; the base vertices come first. ``parents`` (N, 3):
-    base vertices that each vertex is made of; ``weights`` (N, 3): their shares, which sum to 1 (0 for
-    parents that are not used).
+    ``mesh``: F 4^level triangles over N welded vertices; the base vertices come first. ``parents``
+    (N, 3): base vertices that each vertex is made of; ``weights`` (N, 3): their shares, which sum
+    to 1 (0 for parents that are not used).
     """
 
     level: int
@@ -36,9 +37,9 @@ class Tessellation:
 
 
 def tessellate(mesh: LatentMesh, level: int) -> Tessellation:
-    """Subdivide ``level`` times. Welded vertices and render vertices are split in step: a midpoint on a UV
-    seam is one vertex with a render vertex in each chart, its texture coordinates the mean of the
-    parents' in that chart."""
+    """Subdivide ``level`` times. Welded vertices and render vertices are split in step: a midpoint
+    on a UV seam is one vertex with a render vertex in each chart, its texture coordinates the mean
+    of the parents' in that chart."""
     if not 0 <= level <= MAX_LEVEL:
         raise ValueError(f"subdivision level {level} is not in 0..{MAX_LEVEL}")
     faces, frames = mesh.faces, mesh.frame_faces
@@ -68,7 +69,9 @@ def _edges(faces: NDArray) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
     low, high = np.minimum(faces, after), np.maximum(faces, after)
     count = int(faces.max()) + 1
     keys, edge_of = np.unique(low * count + high, return_inverse=True)
-    return np.stack([keys // count, keys % count], axis=1), edge_of.reshape(faces.shape).astype(np.int32)
+    return np.stack([keys // count, keys % count], axis=1), edge_of.reshape(faces.shape).astype(
+        np.int32
+    )
 
 
 def _split(faces: NDArray, middle: NDArray) -> NDArray[np.int32]:
@@ -83,7 +86,11 @@ def _split(faces: NDArray, middle: NDArray) -> NDArray[np.int32]:
     a, b, c = faces.T
     ab, bc, ca = middle.T
     children = ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))
-    return np.stack([np.stack(child, axis=1) for child in children], axis=1).reshape(-1, 3).astype(np.int32)
+    return (
+        np.stack([np.stack(child, axis=1) for child in children], axis=1)
+        .reshape(-1, 3)
+        .astype(np.int32)
+    )
 
 
 def _rows(matrix: sp.csr_matrix) -> tuple[NDArray[np.int32], NDArray[np.float32]]:

@@ -1,8 +1,8 @@
 """Fitted maps: packed texels, their encoding, and the mip pyramid that the renderer reads.
 
-Colours are stored as the square root of linear values, so that a step of the optimiser means about the same
-to the eye in dark and in light regions. Normals are stored with any length, and mean unit ones, as in a file; mip
-levels are means of those. Everything else is stored as it is.
+Colours are stored as the square root of linear values, so that a step of the optimiser means about
+the same to the eye in dark and in light regions. Normals are stored with any length, and mean unit
+ones, as in a file; mip levels are means of those. Everything else is stored as it is.
 """
 
 from __future__ import annotations
@@ -36,7 +36,8 @@ MAX_LEVELS = 7
 
 
 class TexelCodec:
-    """Shape and encoding of one packed, square, clamped texture of ``size`` texels (a power of two)."""
+    """Shape and encoding of one packed, square, clamped texture of ``size`` texels (a power of
+    two)."""
 
     def __init__(self, channels: tuple[str, ...], size: int) -> None:
         self.channels = channels
@@ -44,11 +45,14 @@ class TexelCodec:
         self.packed = 1 << (len(channels) - 1).bit_length()
         self.layout = pyramid_layout([(size, size)], self.packed, [CLAMP], MAX_LEVELS)
         self._template = Pyramid.of(self.layout, mi.Float(0))
-        self._normal = [channels.index(name) for name in NORMALS] if set(NORMALS) <= set(channels) else []
+        self._normal = (
+            [channels.index(name) for name in NORMALS] if set(NORMALS) <= set(channels) else []
+        )
         self._is_color = [c in COLORS for c in channels] + [False] * (self.packed - len(channels))
 
     def encode(self, maps: Mapping[str, NDArray | float]) -> mi.Float:
-        """Stored values of maps in natural units: channel name -> (size, size), or a number for all texels."""
+        """Stored values of maps in natural units: channel name -> (size, size), or a number for all
+        texels."""
         out = np.zeros((self.size, self.size, self.packed), np.float32)
         for k, name in enumerate(self.channels):
             low, high = BOUNDS[name]
@@ -57,7 +61,8 @@ class TexelCodec:
         return mi.Float(out.ravel())
 
     def layer(self, stored: mi.Float) -> TexelLayer:
-        """Pyramid of the stored values, ready for the renderer. Not differentiated: see ``pull_back``."""
+        """Pyramid of the stored values, ready for the renderer. Not differentiated: see
+        ``pull_back``."""
         sizes, offsets = self.layout.sizes[0], self.layout.offsets[0]
         with dr.suspend_grad():
             texels = dr.empty(mi.Float, self.layout.texel_count * self.packed)
@@ -73,8 +78,8 @@ class TexelCodec:
         return TexelLayer(self.channels, self._template.with_texels(texels))
 
     def _finest_levels(self, stored: mi.Float, texels: mi.Float) -> mi.Float:
-        """Write the decoded values and their means over 2 x 2 into the pyramid ``texels``, and return those means: in
-        one pass over the memory, which is what takes the time."""
+        """Write the decoded values and their means over 2 x 2 into the pyramid ``texels``, and
+        return those means: in one pass over the memory, which is what takes the time."""
         half = self.size // 2
         i = dr.arange(mi.UInt32, half * half)
         y = i // half
@@ -107,7 +112,8 @@ class TexelCodec:
         rows = [g * (2 * t) if c else g for g, t, c in zip(own, texel, self._is_color, strict=True)]
         if self._normal:
             n, g = (mi.Vector3f(*(v[k] for k in self._normal)) for v in (texel, rows))
-            # the part along the normal does nothing; rounding would leave some, of which Adam makes whole steps
+            # the part along the normal does nothing; rounding would leave some, of which Adam makes
+            # whole steps
             inverse = dr.rcp(dr.squared_norm(n))
             g = (g - n * (dr.dot(n, g) * inverse)) * dr.sqrt(inverse)
             for k, value in zip(self._normal, g, strict=True):
@@ -118,12 +124,19 @@ class TexelCodec:
         """Natural values on the host: channel name -> (size, size)."""
         texels = np.array(stored).reshape(self.size, self.size, self.packed)
         if self._normal:
-            texels[..., self._normal] /= np.linalg.norm(texels[..., self._normal], axis=-1, keepdims=True)
-        return {n: texels[..., k] ** 2 if n in COLORS else texels[..., k] for k, n in enumerate(self.channels)}
+            texels[..., self._normal] /= np.linalg.norm(
+                texels[..., self._normal], axis=-1, keepdims=True
+            )
+        return {
+            n: texels[..., k] ** 2 if n in COLORS else texels[..., k]
+            for k, n in enumerate(self.channels)
+        }
 
     def per_channel(self, values: Mapping[str, float]) -> mi.Float:
         """One number per packed channel (0 for padding)."""
-        return mi.Float([values[c] for c in self.channels] + [0.0] * (self.packed - len(self.channels)))
+        return mi.Float(
+            [values[c] for c in self.channels] + [0.0] * (self.packed - len(self.channels))
+        )
 
     def _decoded(self, rows: mi.ArrayXf) -> mi.ArrayXf:
         """Natural values of stored texels: linear colours, unit normals."""
@@ -148,7 +161,8 @@ def _flat(rows: list[mi.Float]) -> mi.Float:
 
 
 def maps_of(values: Mapping[str, NDArray | float]) -> MaterialMaps:
-    """Maps of one atlas for the renderer: of each channel an image (size, size), or a number, in natural units."""
+    """Maps of one atlas for the renderer: of each channel an image (size, size), or a number, in
+    natural units."""
     images = {n: np.asarray(values[n]) for n in CHANNELS if n in values and np.ndim(values[n])}
     codec = TexelCodec(tuple(images), len(next(iter(images.values()))))
     constants = {n: float(v) for n, v in values.items() if not np.ndim(v)}

@@ -26,9 +26,10 @@ class Reference(Protocol):
 class PointReference(Reference, Protocol):
     """A reference that can also look along single rays.
 
-    ``pair`` returns two images like that of ``render``: one averaged over the pixels' areas at least where outlines
-    pass, and what the ray through the middle of each pixel sees, its textures filtered over ``width`` pixels. A fit
-    that compares point with point needs one sample per pixel and sees no aliasing: both sides alias alike.
+    ``pair`` returns two images like that of ``render``: one averaged over the pixels' areas at
+    least where outlines pass, and what the ray through the middle of each pixel sees, its textures
+    filtered over ``width`` pixels. A fit that compares point with point needs one sample per pixel
+    and sees no aliasing: both sides alias alike.
     """
 
     def pair(

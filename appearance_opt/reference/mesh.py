@@ -35,9 +35,9 @@ MAX_PIXELS = 1 << 20
 
 @dataclass(frozen=True)
 class MergedMesh:
-    """All meshes of an asset as one, vertices split where attributes differ. See ``asset.types.Mesh``; ``colors``
-    (V, 4) have alpha.
-    ``material``: (F,) index into the asset's materials, in the order of its meshes."""
+    """All meshes of an asset as one, vertices split where attributes differ. See
+    ``asset.types.Mesh``; ``colors`` (V, 4) have alpha. ``material``: (F,) index into the asset's
+    materials, in the order of its meshes."""
 
     positions: NDArray[np.float32]
     normals: NDArray[np.float32]
@@ -49,11 +49,13 @@ class MergedMesh:
 
 
 class MeshReference:
-    """Renders an asset. Also answers what its surface looks like at given points (for the transfer).
+    """Renders an asset. Also answers what its surface looks like at given points (for the
+    transfer).
 
-    ``merged``: the host arrays; ``single`` (F,): faces that are seen from their front only; ``scene``: for tracing
-    rays; ``surface``, ``maps``: device data; ``emission``: what the materials emit, which is not rendered; None if
-    they do not; ``coverage``: what light the materials keep back; None if all of it.
+    ``merged``: the host arrays; ``single`` (F,): faces that are seen from their front only;
+    ``scene``: for tracing rays; ``surface``, ``maps``: device data; ``emission``: what the
+    materials emit, which is not rendered; None if they do not; ``coverage``: what light the
+    materials keep back; None if all of it.
     """
 
     def __init__(self, asset: Asset) -> None:
@@ -62,18 +64,24 @@ class MeshReference:
         self.maps = material_maps(list(by_id.values()))
         self.emission = emission_maps(list(by_id.values()))
         self.coverage = coverage_maps(list(by_id.values()))
-        self.merged = merge(asset, [number[id(m.material)] for m in asset.meshes], self.maps.has_normal_map)
+        self.merged = merge(
+            asset, [number[id(m.material)] for m in asset.meshes], self.maps.has_normal_map
+        )
         m = self.merged
         self.single = single_sided(asset.meshes)
         passing = None
         if self.coverage is not None:
-            passing = np.repeat([seen_through(m) for m in asset.meshes], [len(m.faces) for m in asset.meshes])
+            passing = np.repeat(
+                [seen_through(m) for m in asset.meshes], [len(m.faces) for m in asset.meshes]
+            )
         hidden_backs = culled(m.positions, m.faces, self.single, passing)
         self.scene = upload.scene_of(m.positions, m.faces, hidden_backs)
         if m.tangents is None:
             frames = upload.packets(2, m.uvs)
         else:
-            frames = upload.packets(8, m.uvs, m.tangents[:, 3], np.zeros(len(m.uvs)), m.tangents[:, :3])
+            frames = upload.packets(
+                8, m.uvs, m.tangents[:, 3], np.zeros(len(m.uvs)), m.tangents[:, :3]
+            )
         padding = np.zeros(len(m.positions))
         self.surface = Surface(
             faces=upload.index_packets(m.faces, m.material),
@@ -132,25 +140,36 @@ class MeshReference:
             self._grid = Grid(views, resolution)
         return self._grid
 
-    def render_device(self, records: mi.Float, grid: Grid, samples: int, width: float | None = None) -> mi.Float:
-        """The same for a batch whose records are on the device; the image stays there, flat. ``width``: as for
-        ``deferred.render_image``."""
+    def render_device(
+        self, records: mi.Float, grid: Grid, samples: int, width: float | None = None
+    ) -> mi.Float:
+        """The same for a batch whose records are on the device; the image stays there, flat.
+        ``width``: as for ``deferred.render_image``."""
         with dr.suspend_grad():
             drawn = self.scene, self.surface, self.maps
             if self.coverage is not None:
-                return layers.render_image(*drawn, self.coverage, records, grid, samples, width, self._run)
+                return layers.render_image(
+                    *drawn, self.coverage, records, grid, samples, width, self._run
+                )
             return deferred.render_image(*drawn, records, grid, samples, width, self._run)
 
-    def sample(self, triangle: mi.UInt32, b1: mi.Float, b2: mi.Float, area: mi.Float) -> SurfaceSample:
-        """Appearance at barycentric points of triangles, averaged over a patch of ``area`` (world units
-        squared). Used by the closed-form transfer."""
+    def sample(
+        self, triangle: mi.UInt32, b1: mi.Float, b2: mi.Float, area: mi.Float
+    ) -> SurfaceSample:
+        """Appearance at barycentric points of triangles, averaged over a patch of ``area`` (world
+        units squared). Used by the closed-form transfer."""
         with dr.suspend_grad():
             hit = interpolate_at(self.surface, triangle, b1, b2, area)
             sample = evaluate(self.maps, hit)
-            return SurfaceSample(sample.base_color, sample.roughness, sample.metalness, shading_normal(hit, sample))
+            return SurfaceSample(
+                sample.base_color, sample.roughness, sample.metalness, shading_normal(hit, sample)
+            )
 
-    def emission_at(self, triangle: mi.UInt32, b1: mi.Float, b2: mi.Float, area: mi.Float) -> list[mi.Float]:
-        """Emitted linear RGB at the same points as ``sample``. Only for a reference with ``emission``."""
+    def emission_at(
+        self, triangle: mi.UInt32, b1: mi.Float, b2: mi.Float, area: mi.Float
+    ) -> list[mi.Float]:
+        """Emitted linear RGB at the same points as ``sample``. Only for a reference with
+        ``emission``."""
         assert self.emission is not None
         if not self.emission.layers:
             return [mi.Float(self.emission.constants[name]) for name in EMISSION]
@@ -161,8 +180,8 @@ class MeshReference:
     def geometry_at(
         self, triangle: mi.UInt32, b1: mi.Float, b2: mi.Float
     ) -> tuple[mi.Point3f, mi.Vector3f, mi.Vector3f]:
-        """(position, normal of the triangle by its winding, interpolated vertex normal), the last turned to
-        the side of the first; unit vectors."""
+        """(position, normal of the triangle by its winding, interpolated vertex normal), the last
+        turned to the side of the first; unit vectors."""
         with dr.suspend_grad():
             hit = interpolate_at(self.surface, triangle, b1, b2, mi.Float(0))
             geometric = face_normal(self.surface, triangle, mi.Bool(True))
@@ -177,8 +196,8 @@ def _host(image: mi.Float, grid: Grid) -> NDArray[np.float32]:
 
 @dataclass
 class SurfaceSample:
-    """Appearance of a reference at points of its surface: linear base colour, roughness, metalness, unit
-    shading normal in world space."""
+    """Appearance of a reference at points of its surface: linear base colour, roughness, metalness,
+    unit shading normal in world space."""
 
     base_color: mi.Color3f
     roughness: mi.Float
@@ -193,14 +212,18 @@ def merge(asset: Asset, material_of: list[int], need_tangents: bool) -> MergedMe
     if need_tangents:
         lacking = [m.tangents is None for m in meshes]
         mapped = [m.material.normal_texture is not None and m.uvs is not None for m in meshes]
-        meshes = replace_chosen(meshes, [a and b for a, b in zip(lacking, mapped, strict=True)], _with_tangents)
+        meshes = replace_chosen(
+            meshes, [a and b for a, b in zip(lacking, mapped, strict=True)], _with_tangents
+        )
     batch = Batch(meshes)
     normals = batch.joined("normals")
     tangents = None
     if need_tangents:
         tangents = batch.joined("tangents")
         free = ~np.any(tangents, axis=1)  # no normal map reads them
-        tangents[free] = np.concatenate([any_tangent(normals[free]), np.ones((int(free.sum()), 1))], axis=1)
+        tangents[free] = np.concatenate(
+            [any_tangent(normals[free]), np.ones((int(free.sum()), 1))], axis=1
+        )
     return MergedMesh(
         positions=batch.joined("positions"),
         normals=normals,
@@ -214,12 +237,15 @@ def merge(asset: Asset, material_of: list[int], need_tangents: bool) -> MergedMe
 
 def _with_tangents(batch: Batch) -> list[Mesh]:
     positions, normals, uvs = (batch.joined(name) for name in ("positions", "normals", "uvs"))
-    index, faces, tangents = split_and_tangents(positions, normals, uvs, batch.faces, batch.mesh_of_vertex)
+    index, faces, tangents = split_and_tangents(
+        positions, normals, uvs, batch.faces, batch.mesh_of_vertex
+    )
     return batch.reindexed(index, faces, tangents=tangents)
 
 
 def _joined_colors(batch: Batch) -> NDArray[np.float32] | None:
-    """(V, 4) vertex colours, white where a mesh has none; the alpha of opaque modes means nothing."""
+    """(V, 4) vertex colours, white where a mesh has none; the alpha of opaque modes means
+    nothing."""
     if not batch.have("colors").any():
         return None
     given = batch.joined("colors", 1.0)

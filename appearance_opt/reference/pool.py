@@ -28,8 +28,9 @@ FIRST = 8
 
 @dataclass(frozen=True)
 class Targets:
-    """Reference images of a batch, flat (batch * pixels * 4): ``average`` over the pixels' areas, and what the rays
-    through their middles see (``points``), or None where the reference cannot tell."""
+    """Reference images of a batch, flat (batch * pixels * 4): ``average`` over the pixels' areas,
+    and what the rays through their middles see (``points``), or None where the reference cannot
+    tell."""
 
     average: mi.Float
     points: mi.Float | None = None
@@ -37,16 +38,18 @@ class Targets:
 
 @dataclass
 class ReferencePool:
-    """At most ``capacity`` views drawn from ``sampler`` at a time, their images rendered when first asked for.
+    """At most ``capacity`` views drawn from ``sampler`` at a time, their images rendered when first
+    asked for.
 
-    The first iterations see new views, ``FIRST`` batches of them. From then on every ``reuse``-th iteration does, and
-    its views take the place of the oldest ones as soon as ``capacity`` is reached; the others draw at random from those
-    that are there. So each view is seen about ``reuse`` times: enough to spare most of the rendering, and few enough
-    that maps of a million texels are not fitted to the noise of a few hundred images. With 0, which is for references
-    that are slow, a first pass sees ``capacity`` views, which then stay for ever.
+    The first iterations see new views, ``FIRST`` batches of them. From then on every ``reuse``-th
+    iteration does, and its views take the place of the oldest ones as soon as ``capacity`` is
+    reached; the others draw at random from those that are there. So each view is seen about
+    ``reuse`` times: enough to spare most of the rendering, and few enough that maps of a million
+    texels are not fitted to the noise of a few hundred images. With 0, which is for references that
+    are slow, a first pass sees ``capacity`` views, which then stay for ever.
 
-    Which views an iteration sees is a pure function of the seed and the iteration: a resumed fit sees the same,
-    and re-renders what it needs. Images are kept in half precision.
+    Which views an iteration sees is a pure function of the seed and the iteration: a resumed fit
+    sees the same, and re-renders what it needs. Images are kept in half precision.
     """
 
     reference: Reference
@@ -109,7 +112,9 @@ class ReferencePool:
         for group in groups:
             views = self.sampler.draw(group, self.batch)
             if isinstance(self.reference, PointReference):
-                images, points = self.reference.pair(views, self.resolution, self.samples, self.point_width)
+                images, points = self.reference.pair(
+                    views, self.resolution, self.samples, self.point_width
+                )
                 self._keep(self._points, group, points)
             else:
                 images = self.reference.render(views, self.resolution, self.samples)
@@ -117,7 +122,9 @@ class ReferencePool:
             for k in range(self.batch):
                 self._views[group * self.batch + k] = views[k : k + 1]
 
-    def _keep(self, kept: dict[int, NDArray[np.float16]], group: int, images: NDArray[np.float32]) -> None:
+    def _keep(
+        self, kept: dict[int, NDArray[np.float16]], group: int, images: NDArray[np.float32]
+    ) -> None:
         what = f"pool batch {group}"
         check_shape(images, self.batch, self.resolution, what)
         # on the device: NumPy takes ten times as long to halve the precision
@@ -138,9 +145,11 @@ def check_shape(images: NDArray[np.float32], count: int, resolution: int, what: 
         )
 
 
-def check_images(images: NDArray[np.float32], count: int, resolution: int, what: str) -> NDArray[np.float32]:
-    """The images, if there are ``count`` of them and every pixel is finite and not negative; ReferenceRenderError
-    naming the first view that is not."""
+def check_images(
+    images: NDArray[np.float32], count: int, resolution: int, what: str
+) -> NDArray[np.float32]:
+    """The images, if there are ``count`` of them and every pixel is finite and not negative;
+    ReferenceRenderError naming the first view that is not."""
     check_shape(images, count, resolution, what)
     ok = np.isfinite(images) & (images >= 0)
     if ok.all():

@@ -25,10 +25,11 @@ _FULL = (*_PLAIN, "normal_x", "normal_y", "normal_z")
 
 
 def material_maps(materials: list[Material]) -> MaterialMaps:
-    """Maps of all materials in one pyramid of half precision, or constants when the only material has no texture.
+    """Maps of all materials in one pyramid of half precision, or constants when the only material
+    has no texture.
 
-    Maps of one material that differ in size are brought to the largest of them. Where none of the materials is lit,
-    they have colours alone.
+    Maps of one material that differ in size are brought to the largest of them. Where none of the
+    materials is lit, they have colours alone.
     """
     unlit = [m.unlit for m in materials]
     constants: dict[str, float] = {UNLIT: 1.0} if all(unlit) else {}
@@ -36,16 +37,22 @@ def material_maps(materials: list[Material]) -> MaterialMaps:
     textured = [m for m in materials if _textures(m)]
     if not textured and len(materials) == 1:
         only = materials[0]
-        constants |= dict(zip(_PLAIN, (*only.base_color, only.roughness, only.metalness), strict=True))
+        constants |= dict(
+            zip(_PLAIN, (*only.base_color, only.roughness, only.metalness), strict=True)
+        )
         return MaterialMaps(constants=constants)
-    channels: tuple[str, ...] = _FULL if any(m.normal_texture is not None for m in materials) else _PLAIN
+    channels: tuple[str, ...] = (
+        _FULL if any(m.normal_texture is not None for m in materials) else _PLAIN
+    )
     if all(unlit):
         channels = COLORS
     # texels are packets of a power of two floats
     bases = [_pack_material(m, 4 if channels is COLORS else 8) for m in materials]
     # a material's maps share one wrap mode here: horizontal wrap of its first texture
     wraps = [_WRAP[_textures(m)[0].wrap[0]] if _textures(m) else REPEAT for m in materials]
-    return MaterialMaps((TexelLayer(channels, build_pyramid(bases, wraps, kind=np.float16)),), constants, some)
+    return MaterialMaps(
+        (TexelLayer(channels, build_pyramid(bases, wraps, kind=np.float16)),), constants, some
+    )
 
 
 def emission_maps(materials: list[Material]) -> MaterialMaps | None:
@@ -55,7 +62,10 @@ def emission_maps(materials: list[Material]) -> MaterialMaps | None:
     if len(materials) == 1 and materials[0].emission_texture is None:
         return MaterialMaps(constants=dict(zip(EMISSION, materials[0].emission, strict=True)))
     bases = [_pack_emission(m) for m in materials]
-    wraps = [REPEAT if m.emission_texture is None else _WRAP[m.emission_texture.wrap[0]] for m in materials]
+    wraps = [
+        REPEAT if m.emission_texture is None else _WRAP[m.emission_texture.wrap[0]]
+        for m in materials
+    ]
     return MaterialMaps((TexelLayer(EMISSION, build_pyramid(bases, wraps, kind=np.float16)),))
 
 
@@ -106,8 +116,8 @@ def _kept_back(m: Material) -> Base:
 
 
 class _Rows:
-    """The linear values of a texture, brought to (height, width), in bands of rows: those of a large one are never
-    all there at once. ``there``: is there a texture at all?"""
+    """The linear values of a texture, brought to (height, width), in bands of rows: those of a
+    large one are never all there at once. ``there``: is there a texture at all?"""
 
     def __init__(self, texture: Texture | None, height: int, width: int) -> None:
         self._texture, self._whole = texture, None
@@ -124,11 +134,14 @@ class _Rows:
 
 
 def _pack_material(m: Material, channels: int) -> Base:
-    """Texels of 8 channels: base colour, roughness, metalness, tangent-space normal in [-1, 1] (which is along the
-    surface's own for materials without a normal map); of 4: base colour and roughness."""
+    """Texels of 8 channels: base colour, roughness, metalness, tangent-space normal in [-1, 1]
+    (which is along the surface's own for materials without a normal map); of 4: base colour and
+    roughness."""
     shapes = [t.pixels.shape[:2] for t in _textures(m)] or [(1, 1)]
     height, width = max(s[0] for s in shapes), max(s[1] for s in shapes)
-    color, orm, normal = (_Rows(t, height, width) for t in (m.base_color_texture, m.orm_texture, m.normal_texture))
+    color, orm, normal = (
+        _Rows(t, height, width) for t in (m.base_color_texture, m.orm_texture, m.normal_texture)
+    )
 
     def rows(start: int, stop: int) -> NDArray[np.float32]:
         out = np.zeros((stop - start, width, 8), np.float32)

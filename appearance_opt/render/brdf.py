@@ -1,7 +1,7 @@
 """Surface reflection: Lambert plus isotropic GGX under one point light.
 
-The formulas are those of glTF 2.0, appendix B (Schlick Fresnel, height-correlated Smith), so that what
-the fit sees is what engines show. Specular colour k_s = (1 - m) 0.04 + m k_d, without the
+The formulas are those of glTF 2.0, appendix B (Schlick Fresnel, height-correlated Smith), so that
+what the fit sees is what engines show. Specular colour k_s = (1 - m) 0.04 + m k_d, without the
 attenuation of Hasselgren et al. 2021, section 3, which no file format has.
 """
 
@@ -15,14 +15,14 @@ import mitsuba as mi
 from appearance_opt.render.math import at_least, clamp, unit
 
 ROUGHNESS_FLOOR = 0.08
-"""Smallest roughness (GGX alpha = roughness^2), after the paper: below it a highlight of a point light
-is smaller than a pixel and its gradient useless."""
+"""Smallest roughness (GGX alpha = roughness^2), after the paper: below it a highlight of a point
+light is smaller than a pixel and its gradient useless."""
 
 
 GRAZING_COSINE = 0.02
-"""Masking takes no flatter angles of light and viewer than this. Where both graze the surface, the highlight goes to
-zero within a range of angles as narrow as that, which hardly any ray meets: with 0.001, a ray that did had derivatives
-a hundred times as large as all others."""
+"""Masking takes no flatter angles of light and viewer than this. Where both graze the surface, the
+highlight goes to zero within a range of angles as narrow as that, which hardly any ray meets: with
+0.001, a ray that did had derivatives a hundred times as large as all others."""
 
 
 @dataclass
@@ -39,7 +39,8 @@ class MaterialSample:
 
 
 def reflect(material: MaterialSample, n: mi.Vector3f, v: mi.Vector3f, l: mi.Vector3f) -> mi.Color3f:  # noqa: E741
-    """BRDF times the cosine of the light, for unit shading normal n, directions to viewer v and light l.
+    """BRDF times the cosine of the light, for unit shading normal n, directions to viewer v and
+    light l.
 
     Zero where the light is below the shading horizon. Reflectance per steradian (linear RGB).
     """
@@ -52,8 +53,8 @@ def reflect(material: MaterialSample, n: mi.Vector3f, v: mi.Vector3f, l: mi.Vect
     masked, nv = (at_least(x, GRAZING_COSINE) for x in (nl, dr.dot(n, v)))
     nh = clamp(dr.dot(n, h), 0, 1)
     vh = clamp(dr.dot(v, h), 0, 1)
-    # (n.h)^2 (alpha^2 - 1) + 1 with the sine from the cross product: near the mirror direction of smooth
-    # surfaces 1 - (n.h)^2 has lost its digits (1 % of the radiance at roughness 0.08)
+    # (n.h)^2 (alpha^2 - 1) + 1 with the sine from the cross product: near the mirror direction of
+    # smooth surfaces 1 - (n.h)^2 has lost its digits (1 % of the radiance at roughness 0.08)
     denominator = dr.fma(dr.square(nh), alpha2, dr.squared_norm(dr.cross(n, h)))
     # of unit vectors it is never below alpha^2; n and h can be zero where normals cancel
     denominator = at_least(denominator, 0.5 * alpha2)
@@ -63,4 +64,6 @@ def reflect(material: MaterialSample, n: mi.Vector3f, v: mi.Vector3f, l: mi.Vect
     visibility = 0.5 / smith
     c = 1 - vh
     fresnel = dr.fma(1 - f0, dr.square(dr.square(c)) * c, f0)
-    return (dr.fma(-fresnel, diffuse, diffuse) + fresnel * (distribution * visibility)) * at_least(nl, 0)
+    return (dr.fma(-fresnel, diffuse, diffuse) + fresnel * (distribution * visibility)) * at_least(
+        nl, 0
+    )

@@ -1,12 +1,12 @@
 """Exact coverage of pixels that a silhouette crosses.
 
-The derivative of a loss is only as good as the image it is taken at, and a few rays per pixel know the
-covered area of a pixel badly. The silhouette points know the line that bounds it. The area on its inner side is
-known in closed form, and so is the share of the pixel's rays that lies there: their difference, times the
-contrast across the line, is what the rays missed (a control variate). It has no bias for any line, so that
-a pixel with several silhouettes, or a bent one, is no worse off than with the rays alone. Only where the sum leaves
-what an image can be (negative radiance, coverage outside of [0, 1]) is it brought back, which is always nearer to the
-truth.
+The derivative of a loss is only as good as the image it is taken at, and a few rays per pixel know
+the covered area of a pixel badly. The silhouette points know the line that bounds it. The area on
+its inner side is known in closed form, and so is the share of the pixel's rays that lies there:
+their difference, times the contrast across the line, is what the rays missed (a control variate).
+It has no bias for any line, so that a pixel with several silhouettes, or a bent one, is no worse
+off than with the rays alone. Only where the sum leaves what an image can be (negative radiance,
+coverage outside of [0, 1]) is it brought back, which is always nearer to the truth.
 """
 
 from __future__ import annotations
@@ -24,7 +24,8 @@ if TYPE_CHECKING:
 
 
 def half_plane_area(nx: mi.Float, ny: mi.Float, distance: mi.Float) -> mi.Float:
-    """Area of the part of the unit square about the origin where n . p < distance, for a unit vector n."""
+    """Area of the part of the unit square about the origin where n . p < distance, for a unit
+    vector n."""
     a, b = dr.abs(nx), dr.abs(ny)
     t = dr.abs(distance)
     wide, narrow = dr.fmax(a, b), dr.fmin(a, b)
@@ -35,9 +36,12 @@ def half_plane_area(nx: mi.Float, ny: mi.Float, distance: mi.Float) -> mi.Float:
     return dr.select(distance > 0, 1 - beyond, beyond)
 
 
-def correction(edges: EdgeSamples, contrast: mi.ArrayXf, pixels: int, samples: int, size: mi.UInt32) -> mi.Float:
-    """What ``samples`` rays per pixel missed: (pixels * 4) premultiplied radiance and coverage, zero where no
-    silhouette point lies. ``contrast``: c_in - c_out at the points; ``size``: resolution."""
+def correction(
+    edges: EdgeSamples, contrast: mi.ArrayXf, pixels: int, samples: int, size: mi.UInt32
+) -> mi.Float:
+    """What ``samples`` rays per pixel missed: (pixels * 4) premultiplied radiance and coverage,
+    zero where no silhouette point lies. ``contrast``: c_in - c_out at the points; ``size``:
+    resolution."""
     row = edges.pixel // size
     column = edges.pixel - row * size
     row -= (row // size) * size
@@ -59,6 +63,9 @@ def correction(edges: EdgeSamples, contrast: mi.ArrayXf, pixels: int, samples: i
 
 
 def add_missed(image: mi.Float, missed: mi.Float) -> mi.Float:
-    """The image (pixels * 4) with what its rays missed: no radiance below 0, no coverage outside of [0, 1]."""
+    """The image (pixels * 4) with what its rays missed: no radiance below 0, no coverage outside of
+    [0, 1]."""
     is_coverage = (dr.arange(mi.UInt32, dr.width(image)) & 3) == 3
-    return at_most(at_least(image + missed, 0), dr.select(is_coverage, mi.Float(1), mi.Float(dr.inf)))
+    return at_most(
+        at_least(image + missed, 0), dr.select(is_coverage, mi.Float(1), mi.Float(dr.inf))
+    )

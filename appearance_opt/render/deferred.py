@@ -1,8 +1,9 @@
 """The deferred renderer: visibility -> samples -> attributes -> material -> light -> pixels.
 
-Every stage is a pure function of device arrays. ``shade`` is differentiable in the surface's buffers and the texels;
-visibility is not (see ``silhouette`` for its derivative). The scene, in which rays are traced, and the surface, which
-is drawn and shaded, are the same mesh at the same place.
+Every stage is a pure function of device arrays. ``shade`` is differentiable in the surface's
+buffers and the texels; visibility is not (see ``silhouette`` for its derivative). The scene, in
+which rays are traced, and the surface, which is drawn and shaded, are the same mesh at the same
+place.
 """
 
 from __future__ import annotations
@@ -26,15 +27,20 @@ if TYPE_CHECKING:
     from appearance_opt.render.passing import Scene
 
 NEAREST_LIGHT = 1e-3
-"""Distance below which a light gets no brighter (the object's radius is 1 in a fit): a point light that touches a
-surface is infinitely bright there."""
+"""Distance below which a light gets no brighter (the object's radius is 1 in a fit): a point light
+that touches a surface is infinitely bright there."""
 
 
 def shade(
-    surface: Surface, maps: MaterialMaps, records: mi.Float, samples: Samples, resolution: mi.Float, width: mi.Float
+    surface: Surface,
+    maps: MaterialMaps,
+    records: mi.Float,
+    samples: Samples,
+    resolution: mi.Float,
+    width: mi.Float,
 ) -> mi.Color3f:
-    """Radiance towards the camera at each sample (all must be hits). Linear RGB. ``width``: width of a
-    sample in pixels, which selects the mip level."""
+    """Radiance towards the camera at each sample (all must be hits). Linear RGB. ``width``: width
+    of a sample in pixels, which selects the mip level."""
     camera = rays.camera_of(records, samples.view)
     hit = interpolate(surface, camera, samples, resolution, width)
     sample = material.evaluate(maps, hit)
@@ -51,7 +57,8 @@ def shade(
 
 @dataclass(frozen=True)
 class Drawing:
-    """What is drawn, and from where. ``records``: see ``Views.records``; ``size``, ``rows``: see ``Grid``."""
+    """What is drawn, and from where. ``records``: see ``Views.records``; ``size``, ``rows``: see
+    ``Grid``."""
 
     surface: Surface
     maps: MaterialMaps
@@ -70,13 +77,13 @@ def render_image(
     width: float | None = None,
     run: Run = traced,
 ) -> mi.Float:
-    """A whole batch of images with ``samples`` samples in every pixel, without gradients. Textures are filtered
-    over ``width`` pixels; by default over the whole pixel where it has one sample, and by the samples alone where it
-    has several: mip levels of normal maps are flatter than what they stand for, and shine in other places. ``run``: how
-    its stages are called (see ``freezing``).
+    """A whole batch of images with ``samples`` samples in every pixel, without gradients. Textures
+    are filtered over ``width`` pixels; by default over the whole pixel where it has one sample, and
+    by the samples alone where it has several: mip levels of normal maps are flatter than what they
+    stand for, and shine in other places. ``run``: how its stages are called (see ``freezing``).
 
-    Returns (pixels * 4) premultiplied linear radiance and coverage. One sample of all pixels at a time,
-    so that memory does not grow with ``samples``.
+    Returns (pixels * 4) premultiplied linear radiance and coverage. One sample of all pixels at a
+    time, so that memory does not grow with ``samples``.
     """
     drawing = Drawing(surface, maps, records, grid.size, grid.rows)
     width = filter_width(samples) if width is None else width
@@ -90,7 +97,8 @@ def render_image(
 
 
 def filter_width(samples: int) -> float:
-    """Width in pixels over which textures are filtered where nothing else is asked for; see ``render_image``."""
+    """Width in pixels over which textures are filtered where nothing else is asked for; see
+    ``render_image``."""
     return 1.0 if samples == 1 else 0.0
 
 
@@ -104,9 +112,10 @@ def render_pair(
     width: float,
     run: Run = traced,
 ) -> tuple[mi.Float, mi.Float]:
-    """(average, points): two images of the same views. ``points`` is what the ray through the middle of each pixel
-    sees, textures filtered over ``width`` pixels; ``average`` is the same away from outlines, and the mean of
-    ``samples`` rays at them. Costs a fraction of ``samples`` full images. ``run``: as in ``render_image``."""
+    """(average, points): two images of the same views. ``points`` is what the ray through the
+    middle of each pixel sees, textures filtered over ``width`` pixels; ``average`` is the same away
+    from outlines, and the mean of ``samples`` rays at them. Costs a fraction of ``samples`` full
+    images. ``run``: as in ``render_image``."""
     drawing = Drawing(surface, maps, records, grid.size, grid.rows)
     hits, depth, covered = _seen(scene, drawing, grid, 0.5, 0.5, run)
     points, mode = dr.zeros(mi.Float, grid.pixels * 4), dr.ReduceMode.NoConflicts
@@ -118,14 +127,17 @@ def render_pair(
         at = grid.view, grid.column, grid.row, index
         fine, hit = rays.trace_pixels(scene, records, *at, samples, grid.size, run)
         mode = dr.ReduceMode.Local
-        average = _add_shaded(average, drawing, fine, dr.compress(hit), 1 / samples, samples**-0.5, mode, run)
+        average = _add_shaded(
+            average, drawing, fine, dr.compress(hit), 1 / samples, samples**-0.5, mode, run
+        )
     return average, points
 
 
 def _seen(
     scene: Scene, drawing: Drawing, grid: Grid, dx: float, dy: float, run: Run
 ) -> tuple[Samples, mi.Float, mi.UInt32]:
-    """(what every pixel shows at the offset (dx, dy), its depth, indices of those that show anything)."""
+    """(what every pixel shows at the offset (dx, dy), its depth, indices of those that show
+    anything)."""
     hits, depth, hit = visible(scene, drawing.surface, drawing.records, grid, dx, dy, run)
     return hits, depth, dr.compress(hit)
 
@@ -133,12 +145,21 @@ def _seen(
 def visible(
     scene: Scene, surface: Surface, records: mi.Float, grid: Grid, dx: float, dy: float, run: Run
 ) -> tuple[Samples, mi.Float, mi.Bool]:
-    """(what every pixel shows at the offset (dx, dy), its depth, does it show anything?). By rays through ``scene`` or
-    by drawing ``surface``, the same mesh, whichever is faster."""
-    at = grid.view, grid.column, grid.row, dr.opaque(mi.Float, dx), dr.opaque(mi.Float, dy), grid.size
+    """(what every pixel shows at the offset (dx, dy), its depth, does it show anything?). By rays
+    through ``scene`` or by drawing ``surface``, the same mesh, whichever is faster."""
+    at = (
+        grid.view,
+        grid.column,
+        grid.row,
+        dr.opaque(mi.Float, dx),
+        dr.opaque(mi.Float, dy),
+        grid.size,
+    )
     if raster.drawing_is_faster(surface, grid):
         mesh = surface.vertices, surface.faces, records
-        hits, depth = run(raster.visible, *mesh, *at, grid.rows, grid.views, grid.pixels, surface.culled)
+        hits, depth = run(
+            raster.visible, *mesh, *at, grid.rows, grid.views, grid.pixels, surface.culled
+        )
     else:
         hits, depth = run(_traced_at, scene, records, *at)
     hit = hits.triangle != rays.MISS
@@ -162,11 +183,14 @@ def _traced_at(
 def _without_outlines(
     points: mi.Float, hits: Samples, depth: mi.Float, rows: mi.UInt32, pixels: int
 ) -> tuple[mi.Float, mi.Bool]:
-    """(the image ``points`` with zeros in the pixels at outlines, whether the pixel of each of ``hits`` is one)."""
+    """(the image ``points`` with zeros in the pixels at outlines, whether the pixel of each of
+    ``hits`` is one)."""
     pixel = pixel_index(hits, rows)
     far = dr.select(hits.triangle == rays.MISS, mi.Float(outlines.NOTHING), depth)
     outlined = outlines.find(far, pixel, rows, pixels)
-    image = dr.select(dr.gather(mi.Bool, outlined, dr.arange(mi.UInt32, pixels * 4) // 4), 0, points)
+    image = dr.select(
+        dr.gather(mi.Bool, outlined, dr.arange(mi.UInt32, pixels * 4) // 4), 0, points
+    )
     return image, dr.gather(mi.Bool, outlined, pixel)
 
 
@@ -180,11 +204,20 @@ def _add_shaded(
     mode: dr.ReduceMode,
     run: Run,
 ) -> mi.Float:
-    """An image (pixels * 4) and the radiance and coverage of the hits at the positions ``index`` of the list, each
-    ``weight`` of its pixel."""
+    """An image (pixels * 4) and the radiance and coverage of the hits at the positions ``index`` of
+    the list, each ``weight`` of its pixel."""
     if dr.width(index) == 0:
         return image
-    out = run(_accumulate, image, drawing, hits, index, dr.opaque(mi.Float, weight), dr.opaque(mi.Float, width), mode)
+    out = run(
+        _accumulate,
+        image,
+        drawing,
+        hits,
+        index,
+        dr.opaque(mi.Float, weight),
+        dr.opaque(mi.Float, width),
+        mode,
+    )
     dr.eval(out)
     return out
 

@@ -1,8 +1,9 @@
 """Functions whose kernels are recorded at the first call and launched again without being traced.
 
-A step of a fit traces the same graphs again and again, which takes Python longer than the kernels of a small image
-run. ``dr.freeze`` replays them. What may be frozen: a function of arrays that makes no array as wide as a Python number
-that changes, reads no array, and compacts nothing. All arrays it sees must be arguments, or be listed as state.
+A step of a fit traces the same graphs again and again, which takes Python longer than the kernels
+of a small image run. ``dr.freeze`` replays them. What may be frozen: a function of arrays that
+makes no array as wide as a Python number that changes, reads no array, and compacts nothing. All
+arrays it sees must be arguments, or be listed as state.
 """
 
 from __future__ import annotations
@@ -20,14 +21,16 @@ if TYPE_CHECKING:
     """Calls its first argument with the others: ``traced`` or a ``Frozen``."""
 
 RECORDINGS = 32
-"""Recordings kept per function. Arrays that happen to be equally wide, or missing, need one of their own."""
+"""Recordings kept per function. Arrays that happen to be equally wide, or missing, need one of
+their own."""
 
 
 class Frozen:
     """Calls functions through recordings, which live as long as this object.
 
-    ``state``: objects whose arrays the functions read without being handed them. Other arguments than arrays are
-    told apart by their hash: keep objects that are hashed by identity alive as long as this one.
+    ``state``: objects whose arrays the functions read without being handed them. Other arguments
+    than arrays are told apart by their hash: keep objects that are hashed by identity alive as long
+    as this one.
     """
 
     def __init__(self, *state: object) -> None:
@@ -40,7 +43,8 @@ class Frozen:
             self._frozen[function] = dr.freeze(
                 function, state_fn=self._state_of_call, limit=RECORDINGS, warn_after=10 * RECORDINGS
             )
-        # a collection in the middle of a call may drop the recordings of another fit, which Dr.Jit does not survive
+        # a collection in the middle of a call may drop the recordings of another fit, which Dr.Jit
+        # does not survive
         collecting = gc.isenabled()
         gc.disable()
         try:
@@ -59,7 +63,8 @@ class Frozen:
 
 
 def _interrupted(error: BaseException | None) -> bool:
-    """Was it Ctrl-C that Dr.Jit reports as an error, or as the cause of one, of a recording or of its arguments?"""
+    """Was it Ctrl-C that Dr.Jit reports as an error, or as the cause of one, of a recording or of
+    its arguments?"""
     while error is not None:
         if isinstance(error, KeyboardInterrupt):
             return True
@@ -73,7 +78,8 @@ def traced(function: Callable, *arguments: Any) -> Any:
 
 
 def arrays_in(*owners: object) -> list:
-    """All Dr.Jit arrays that objects hold, in containers, data classes and attributes, each once."""
+    """All Dr.Jit arrays that objects hold, in containers, data classes and attributes, each
+    once."""
     found: list = []
     seen: set[int] = set()
 

@@ -1,16 +1,16 @@
 """One differentiable batch of images: forward now, gradients when the caller knows dLoss/dImage.
 
-Between the two stands the loss, which is a function of whole pixels. So the backward pass shades the same
-samples again, with gradients, and pulls back
+Between the two stands the loss, which is a function of whole pixels. So the backward pass shades
+the same samples again, with gradients, and pulls back
 
     sum over samples  weight * <dLoss/dI(pixel), colour>                      (interior)
   + sum over silhouette points  length * <dLoss/dI(pixel), c_in - c_out> n.x  (visibility),
 
 everything but the surface's buffers held fixed. The image itself is never differentiated.
 
-Most pixels hold no silhouette, and a few samples: their colour is the mean of these. When the loss is a sum over
-pixels, ``render(..., defer=True)`` leaves them out, and ``direct`` shades them, takes the loss and goes back in
-one kernel: half the work.
+Most pixels hold no silhouette, and a few samples: their colour is the mean of these. When the loss
+is a sum over pixels, ``render(..., defer=True)`` leaves them out, and ``direct`` shades them, takes
+the loss and goes back in one kernel: half the work.
 """
 
 from __future__ import annotations
@@ -42,7 +42,8 @@ if TYPE_CHECKING:
 
 
 DEFERRED = 4
-"""Samples per pixel up to which pixels are deferred: the kernel shades each of them in code of its own."""
+"""Samples per pixel up to which pixels are deferred: the kernel shades each of them in code of its
+own."""
 
 
 @dataclass
@@ -50,11 +51,12 @@ class RenderedBatch:
     """A rendered batch and what its backward pass needs.
 
     ``image``: (pixels * 4) premultiplied linear radiance and coverage, without the deferred pixels.
-    ``averaged``: the covered camera rays that are averaged in it; ``deferred``: those that are not in the image
-    yet, all of their pixels; None without any. ``crossed``: indices of the pixels that a silhouette
-    crosses; ``edges``: its visible points, None without any; ``contrast``: c_in - c_out at them, premultiplied RGB
-    and coverage. ``intersections``, ``intersections_contrast``: the same where surfaces run into
-    each other, None unless pairs or ``Quality.intersections`` look for that.
+    ``averaged``: the covered camera rays that are averaged in it; ``deferred``: those that are not
+    in the image yet, all of their pixels; None without any. ``crossed``: indices of the pixels that
+    a silhouette crosses; ``edges``: its visible points, None without any; ``contrast``: c_in -
+    c_out at them, premultiplied RGB and coverage. ``intersections``, ``intersections_contrast``:
+    the same where surfaces run into each other, None unless pairs or ``Quality.intersections`` look
+    for that.
     """
 
     grid: Grid
@@ -89,33 +91,63 @@ def render(
     defer: bool = False,
     run: Run = traced,
 ) -> RenderedBatch:
-    """Forward pass, without gradients (``surface`` and ``maps`` are read detached). With ``defer``, pixels of
-    few samples that no silhouette crosses are not shaded but left to ``direct``. ``run``: how its stages are called
-    (see ``freezing``)."""
+    """Forward pass, without gradients (``surface`` and ``maps`` are read detached). With ``defer``,
+    pixels of few samples that no silhouette crosses are not shaded but left to ``direct``. ``run``:
+    how its stages are called (see ``freezing``)."""
     with dr.suspend_grad():
         edges, met, filtered = None, None, quality.sample_width
         if quality.visibility == "pairs" and edge_list is not None:
-            found = pairs.paired_samples(scene, edge_list, surface.vertices, records, grid, quality, defer, run)
+            found = pairs.paired_samples(
+                scene, edge_list, surface.vertices, records, grid, quality, defer, run
+            )
             averaged, deferred, crossed = found.averaged, found.deferred, found.crossed
-            edges, met, filtered = found.edges, found.intersections, quality.sample_width / isqrt(quality.samples)
+            edges, met, filtered = (
+                found.edges,
+                found.intersections,
+                quality.sample_width / isqrt(quality.samples),
+            )
         else:
             if quality.visibility == "edges" and edge_list is not None and quality.edge_density > 0:
                 edges = silhouette.sample_edges(
-                    scene, edge_list, surface.vertices, records, grid, quality.edge_density, seed, run
+                    scene,
+                    edge_list,
+                    surface.vertices,
+                    records,
+                    grid,
+                    quality.edge_density,
+                    seed,
+                    run,
                 )
                 if quality.intersections:
                     per_axis = isqrt(quality.samples)
-                    met = pairs.find_intersections(scene, edge_list, surface.vertices, records, grid, per_axis, run)
+                    met = pairs.find_intersections(
+                        scene, edge_list, surface.vertices, records, grid, per_axis, run
+                    )
             crossing = [b.pixel for b in (edges, met) if b is not None]
-            averaged, deferred, crossed = _camera_samples(scene, surface, records, grid, crossing, quality, defer, run)
+            averaged, deferred, crossed = _camera_samples(
+                scene, surface, records, grid, crossing, quality, defer, run
+            )
         width = dr.opaque(mi.Float, filtered)
         # pairs blend what few rays miss; elsewhere the silhouette's line knows it
         corrected = quality.edge_samples if quality.visibility == "edges" else None
         image, contrast, met_contrast = run(
-            _averages, surface, maps, records, grid.size, grid.rows, grid.pixels, averaged, edges, met, width, corrected
+            _averages,
+            surface,
+            maps,
+            records,
+            grid.size,
+            grid.rows,
+            grid.pixels,
+            averaged,
+            edges,
+            met,
+            width,
+            corrected,
         )
         dr.eval(image, contrast, met_contrast)
-    return RenderedBatch(grid, records, image, averaged, deferred, crossed, edges, contrast, met, met_contrast)
+    return RenderedBatch(
+        grid, records, image, averaged, deferred, crossed, edges, contrast, met, met_contrast
+    )
 
 
 def _averages(
@@ -131,8 +163,9 @@ def _averages(
     width: mi.Float,
     corrected: int | None,
 ) -> tuple[mi.Float, mi.ArrayXf | None, mi.ArrayXf | None]:
-    """(image without the deferred pixels, contrast at the silhouette points, and where surfaces meet). ``width`` of the
-    texture filter of contrasts in pixels; ``corrected``: rays per pixel of which the image corrects the coverage."""
+    """(image without the deferred pixels, contrast at the silhouette points, and where surfaces
+    meet). ``width`` of the texture filter of contrasts in pixels; ``corrected``: rays per pixel of
+    which the image corrects the coverage."""
     image = dr.zeros(mi.Float, pixels * 4)
     if averaged is not None:
         w = averaged.weight
@@ -140,7 +173,8 @@ def _averages(
         value = mi.ArrayXf([c.x * w, c.y * w, c.z * w, w])
         dr.scatter_reduce(dr.ReduceOp.Add, image, value, averaged.pixel, mode=dr.ReduceMode.Local)
     contrast, met_contrast = (
-        None if b is None else _contrast(surface, maps, records, b.inside, b.outside, size, width) for b in (edges, met)
+        None if b is None else _contrast(surface, maps, records, b.inside, b.outside, size, width)
+        for b in (edges, met)
     )
     if edges is not None and corrected is not None:
         dr.eval(image, contrast)
@@ -150,10 +184,13 @@ def _averages(
 
 
 def direct(
-    batch: RenderedBatch, surface: Surface, maps: MaterialMaps, pixel_loss: Callable[[mi.Color3f, mi.UInt32], mi.Float]
+    batch: RenderedBatch,
+    surface: Surface,
+    maps: MaterialMaps,
+    pixel_loss: Callable[[mi.Color3f, mi.UInt32], mi.Float],
 ) -> mi.Float | None:
-    """Loss of each deferred pixel, differentiable: ``pixel_loss(radiance, pixel)`` of its radiance (all
-    deferred pixels are fully covered). None without any."""
+    """Loss of each deferred pixel, differentiable: ``pixel_loss(radiance, pixel)`` of its radiance
+    (all deferred pixels are fully covered). None without any."""
     if batch.deferred is None:
         return None
     d = batch.deferred
@@ -162,12 +199,17 @@ def direct(
 
 
 def surrogate(
-    batch: RenderedBatch, surface: Surface, maps: MaterialMaps, edge_list: EdgeList | None, image_gradient: mi.Float
+    batch: RenderedBatch,
+    surface: Surface,
+    maps: MaterialMaps,
+    edge_list: EdgeList | None,
+    image_gradient: mi.Float,
 ) -> list[mi.Float]:
-    """Arrays whose sums have the loss's derivative, for ``image_gradient`` = dLoss/dImage (pixels * 4).
+    """Arrays whose sums have the loss's derivative, for ``image_gradient`` = dLoss/dImage (pixels *
+    4).
 
-    Only their gradients mean anything: pass them to ``backward``. They are not summed here, as a sum would
-    evaluate them and make the backward pass shade once more. Empty when the batch is.
+    Only their gradients mean anything: pass them to ``backward``. They are not summed here, as a
+    sum would evaluate them and make the backward pass shade once more. Empty when the batch is.
     """
     terms = []
     if batch.averaged is not None:
@@ -180,11 +222,15 @@ def surrogate(
     moving = (edge_list, surface.vertices, batch.records)
     if batch.edges is not None:
         jump = _jump(image_gradient, batch.edges.pixel, batch.contrast)
-        terms.append(jump * batch.edges.length * silhouette.motion(*moving, batch.edges, batch.grid.size))
+        terms.append(
+            jump * batch.edges.length * silhouette.motion(*moving, batch.edges, batch.grid.size)
+        )
     if batch.intersections is not None:
         jump = _jump(image_gradient, batch.intersections.pixel, batch.intersections_contrast)
         terms.append(
-            jump * batch.intersections.area * intersections.motion(*moving, batch.intersections, batch.grid.size)
+            jump
+            * batch.intersections.area
+            * intersections.motion(*moving, batch.intersections, batch.grid.size)
         )
     return terms
 
@@ -209,8 +255,8 @@ def _camera_samples(
     defer: bool,
     run: Run,
 ) -> tuple[Weighted | None, Whole | None, mi.UInt32 | None]:
-    """Covered camera rays, (averaged, deferred): ``samples`` in each pixel, ``edge_samples`` in those of ``crossing``,
-    where a boundary passes; and these pixels, each once."""
+    """Covered camera rays, (averaged, deferred): ``samples`` in each pixel, ``edge_samples`` in
+    those of ``crossing``, where a boundary passes; and these pixels, each once."""
     on_edge = dr.zeros(mi.Bool, grid.pixels)
     for pixels in crossing:
         dr.scatter(on_edge, mi.Bool(True), pixels)
@@ -220,7 +266,9 @@ def _camera_samples(
     dr.eval(on_edge, pixel)
 
     def rays_in(places: mi.UInt32, count: int) -> tuple[Samples, mi.Bool]:
-        return rays.trace_pixels(scene, records, grid.view, grid.column, grid.row, places, count, grid.size, run)
+        return rays.trace_pixels(
+            scene, records, grid.view, grid.column, grid.row, places, count, grid.size, run
+        )
 
     if quality.samples == 1:
         fine, _, covered = visible(scene, surface, records, grid, 0.5, 0.5, run)
@@ -242,9 +290,11 @@ def _camera_samples(
     return _merge_weighted(parts, weights, grid, quality.sample_width), deferred, crossed
 
 
-def _whole_pixels(fine: Samples, covered: mi.Bool, grid: Grid, quality: Quality) -> tuple[Whole | None, mi.Bool | None]:
-    """(the pixels whose rays are all ``covered``, which other rays are: None of one per pixel). ``fine``: as from
-    ``rays.trace_pixels``."""
+def _whole_pixels(
+    fine: Samples, covered: mi.Bool, grid: Grid, quality: Quality
+) -> tuple[Whole | None, mi.Bool | None]:
+    """(the pixels whose rays are all ``covered``, which other rays are: None of one per pixel).
+    ``fine``: as from ``rays.trace_pixels``."""
     count, others = quality.samples, None
     if count == 1:
         first = dr.compress(covered)
@@ -255,7 +305,9 @@ def _whole_pixels(fine: Samples, covered: mi.Bool, grid: Grid, quality: Quality)
             whole &= dr.gather(mi.Bool, covered, start + k)
         dr.eval(whole)
         first = dr.compress(whole) * count
-        others = covered & ~dr.gather(mi.Bool, whole, dr.arange(mi.UInt32, dr.width(covered)) // count)
+        others = covered & ~dr.gather(
+            mi.Bool, whole, dr.arange(mi.UInt32, dr.width(covered)) // count
+        )
     if dr.width(first) == 0:
         return None, others
     every = [rays.keep(fine, first + k) for k in range(count)]
@@ -265,7 +317,9 @@ def _whole_pixels(fine: Samples, covered: mi.Bool, grid: Grid, quality: Quality)
     return Whole(every, pixel, dr.opaque(mi.Float, width)), others
 
 
-def _merge_weighted(parts: list[Samples], weights: list[float], grid: Grid, width_of_one: float) -> Weighted | None:
+def _merge_weighted(
+    parts: list[Samples], weights: list[float], grid: Grid, width_of_one: float
+) -> Weighted | None:
     """Lists of samples as one; each list has its weight."""
     there = [(p, w) for p, w in zip(parts, weights, strict=True) if dr.width(p.triangle)]
     if not there:

@@ -1,8 +1,10 @@
-"""Images of surfaces that are seen through others: the layers along each ray, blended from the eye on.
+"""Images of surfaces that are seen through others: the layers along each ray, blended from the eye
+on.
 
-Every material keeps back a share of what lies behind it, its coverage: that of cut-outs is 0 or 1. A ray that is not
-kept back altogether goes on behind what it met. Colours are blended with the "over" operator (Porter and Duff 1984), in
-linear radiance, so that coverage in the image becomes fractional. Without gradients.
+Every material keeps back a share of what lies behind it, its coverage: that of cut-outs is 0 or 1.
+A ray that is not kept back altogether goes on behind what it met. Colours are blended with the
+"over" operator (Porter and Duff 1984), in linear radiance, so that coverage in the image becomes
+fractional. Without gradients.
 """
 
 from __future__ import annotations
@@ -29,14 +31,15 @@ if TYPE_CHECKING:
     from appearance_opt.render.surface import Hit, Surface
 
 MOST = 128
-"""Layers that a ray is followed through, empty parts of cut-outs included. What lies behind is not drawn: the light
-that is left counts as background."""
+"""Layers that a ray is followed through, empty parts of cut-outs included. What lies behind is not
+drawn: the light that is left counts as background."""
 
 LEAST = 1 / 1024
 """Share of a ray that is not worth following: a quarter of an 8-bit step."""
 
 CHANNELS = ("coverage", "cutoff")
-"""Channels of the maps of coverage. Where there is a cutoff (not negative), coverage is tested against it."""
+"""Channels of the maps of coverage. Where there is a cutoff (not negative), coverage is tested
+against it."""
 
 
 @dataclass(frozen=True)
@@ -64,8 +67,8 @@ def render_image(
     width: float | None = None,
     run: Run = traced,
 ) -> mi.Float:
-    """``deferred.render_image`` of a surface that is seen through. Memory grows neither with ``samples`` nor with the
-    layers; rays whose light is used up take no part in further layers."""
+    """``deferred.render_image`` of a surface that is seen through. Memory grows neither with
+    ``samples`` nor with the layers; rays whose light is used up take no part in further layers."""
     drawing = deferred.Drawing(surface, maps, records, grid.size, grid.rows)
     width = deferred.filter_width(samples) if width is None else width
     weight, filtered = dr.opaque(mi.Float, 1 / samples), dr.opaque(mi.Float, width)
@@ -93,14 +96,22 @@ def render_image(
     return image
 
 
-def _taken(index: mi.UInt32, hits: Samples, depth: mi.Float, light: mi.Float) -> tuple[Samples, mi.Float, mi.Float]:
+def _taken(
+    index: mi.UInt32, hits: Samples, depth: mi.Float, light: mi.Float
+) -> tuple[Samples, mi.Float, mi.Float]:
     """Those at the positions ``index`` of the lists."""
-    out = rays.keep(hits, index), dr.gather(mi.Float, depth, index), dr.gather(mi.Float, light, index)
+    out = (
+        rays.keep(hits, index),
+        dr.gather(mi.Float, depth, index),
+        dr.gather(mi.Float, light, index),
+    )
     dr.eval(out)
     return out
 
 
-def _kept_back(drawing: Drawing, coverage: Coverage, hits: Samples, light: mi.Float, width: mi.Float) -> mi.Float:
+def _kept_back(
+    drawing: Drawing, coverage: Coverage, hits: Samples, light: mi.Float, width: mi.Float
+) -> mi.Float:
     """What hits keep back of the ``light`` of their rays."""
     camera = rays.camera_of(drawing.records, hits.view)
     return coverage.at(interpolate(drawing.surface, camera, hits, drawing.size, width)) * light
@@ -115,7 +126,8 @@ def _blend(
     width: mi.Float,
     run: Run,
 ) -> mi.Float:
-    """The image with a layer of hits, one at most per pixel: only those are shaded that keep anything back."""
+    """The image with a layer of hits, one at most per pixel: only those are shaded that keep
+    anything back."""
     index = dr.compress(share > 0)
     if dr.width(index) == 0:
         return image
@@ -134,7 +146,9 @@ def _accumulate(
     width: mi.Float,
 ) -> mi.Float:
     some = rays.keep(hits, index)
-    color = deferred.shade(drawing.surface, drawing.maps, drawing.records, some, drawing.size, width)
+    color = deferred.shade(
+        drawing.surface, drawing.maps, drawing.records, some, drawing.size, width
+    )
     part = dr.gather(mi.Float, share, index) * weight
     out = mi.Float(image)
     value = mi.ArrayXf([color.x * part, color.y * part, color.z * part, part])

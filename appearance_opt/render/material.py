@@ -1,7 +1,7 @@
 """From packed texels to material parameters.
 
-The layers of a ``MaterialMaps`` name the channels of their texels; what is not among them is a constant
-of the job: it has no texture, no gradient and no lookup.
+The layers of a ``MaterialMaps`` name the channels of their texels; what is not among them is a
+constant of the job: it has no texture, no gradient and no lookup.
 """
 
 from __future__ import annotations
@@ -16,7 +16,8 @@ import mitsuba as mi
 from appearance_opt.render.brdf import MaterialSample
 from appearance_opt.render.math import unit
 
-# not only for the type checker: Dr.Jit resolves the annotations of data classes when it looks for arrays
+# not only for the type checker: Dr.Jit resolves the annotations of data classes when it looks for
+# arrays
 from appearance_opt.render.texture import Pyramid
 
 if TYPE_CHECKING:
@@ -28,7 +29,8 @@ UNLIT = "unlit"
 COLORS = ("red", "green", "blue")
 
 CHANNELS = ("red", "green", "blue", "roughness", "metalness", "normal_x", "normal_y", "normal_z")
-"""Every channel a material can have. Colours are linear, normals in [-1, 1], all three of their channels or none."""
+"""Every channel a material can have. Colours are linear, normals in [-1, 1], all three of their
+channels or none."""
 
 DEFAULTS = {"red": 0.5, "green": 0.5, "blue": 0.5, "roughness": 0.5, "metalness": 0.0}
 """What a channel is that a material does not have."""
@@ -54,10 +56,10 @@ class TexelLayer:
 
 @dataclass(frozen=True)
 class MaterialMaps:
-    """Everything that is known of the materials of a surface: ``layers`` of maps (a fit keeps the maps
-    that move and those that do not in different layers) and ``constants`` for the channels without one. ``unlit``:
-    which of several materials are shown without light, None if none is; all of them are with the constant
-    ``UNLIT``."""
+    """Everything that is known of the materials of a surface: ``layers`` of maps (a fit keeps the
+    maps that move and those that do not in different layers) and ``constants`` for the channels
+    without one. ``unlit``: which of several materials are shown without light, None if none is; all
+    of them are with the constant ``UNLIT``."""
 
     layers: tuple[TexelLayer, ...] = ()
     constants: Mapping[str, float] = field(default_factory=dict)
@@ -86,7 +88,8 @@ def evaluate(maps: MaterialMaps, hit: Hit) -> MaterialSample:
 
 
 def shading_normal(hit: Hit, sample: MaterialSample) -> mi.Vector3f:
-    """World-space shading normal: the normal map in the hit's interpolated tangent basis (glTF 2.0, 3.9.3)."""
+    """World-space shading normal: the normal map in the hit's interpolated tangent basis (glTF 2.0,
+    3.9.3)."""
     if sample.normal is None or hit.tangent is None:
         return hit.normal
     bitangent = dr.cross(hit.normal, hit.tangent) * hit.handedness

@@ -1,9 +1,10 @@
 """Bounds on device arrays.
 
-Dr.Jit's ``maximum``/``minimum``/``clip`` propagate NaNs through an LLVM intrinsic that x86 has only since
-LLVM 17; older libraries, which current long-term distributions still ship, abort the whole process on
-it. These are built on the NaN-ignoring ``fmax``/``fmin``, which every version compiles. A NaN is caught
-where it shows: in the gradients of every step and in the held-out images (see ``fit``), not here.
+Dr.Jit's ``maximum``/``minimum``/``clip`` propagate NaNs through an LLVM intrinsic that x86 has only
+since LLVM 17; older libraries, which current long-term distributions still ship, abort the whole
+process on it. These are built on the NaN-ignoring ``fmax``/``fmin``, which every version compiles.
+A NaN is caught where it shows: in the gradients of every step and in the held-out images (see
+``fit``), not here.
 """
 
 from __future__ import annotations
@@ -45,8 +46,8 @@ ARC_TANGENT = (
 
 
 def angle_of(sine: mi.Float, cosine: mi.Float) -> mi.Float:
-    """Angle in [0, pi] of a sine that is positive and a cosine, both up to a common factor: ``dr.atan2`` is built on
-    the minimum and maximum that propagate NaNs."""
+    """Angle in [0, pi] of a sine that is positive and a cosine, both up to a common factor:
+    ``dr.atan2`` is built on the minimum and maximum that propagate NaNs."""
     across = dr.abs(cosine)
     steep = sine > across
     t = dr.select(steep, across, sine) / dr.select(steep, sine, across)

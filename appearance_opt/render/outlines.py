@@ -9,15 +9,16 @@ DISCONTINUITY = 1.02
 """Ratio of depths between neighbouring pixels from which an outline may pass between them."""
 
 REACH = 1
-"""Pixels beyond the two at a jump that count as being at an outline: that of a fitted shape lies a little away."""
+"""Pixels beyond the two at a jump that count as being at an outline: that of a fitted shape lies a
+little away."""
 
 NOTHING = 1e30
 """Depth of pixels that show nothing."""
 
 
 def find(depth: mi.Float, pixel: mi.UInt32, rows: mi.UInt32, pixels: int) -> mi.Bool:
-    """(pixels,) which pixels are at an outline. ``depth`` of every pixel, of which ``pixel`` is the index in the batch:
-    (view, row, column) of images of ``rows`` rows and columns."""
+    """(pixels,) which pixels are at an outline. ``depth`` of every pixel, of which ``pixel`` is the
+    index in the batch: (view, row, column) of images of ``rows`` rows and columns."""
     image = dr.empty(mi.Float, pixels)
     dr.scatter(image, depth, pixel, mode=dr.ReduceMode.Permute)
     dr.eval(image)
@@ -26,8 +27,8 @@ def find(depth: mi.Float, pixel: mi.UInt32, rows: mi.UInt32, pixels: int) -> mi.
 
 
 def _jumps(depth: mi.Float, batch: _Neighbourhood) -> mi.Bool:
-    """Pixels beside a jump in depth or a border of the object. Only neighbours in a row or column are compared: further
-    apart, the depths of any slanted surface differ."""
+    """Pixels beside a jump in depth or a border of the object. Only neighbours in a row or column
+    are compared: further apart, the depths of any slanted surface differ."""
     nearest = farthest = depth
     for axis in (0, 1):
         for neighbour in batch.neighbours(axis, 1):
@@ -46,7 +47,8 @@ class _Neighbourhood:
         self._axes = (self._index - line * rows, mi.UInt32(1)), (line % rows, rows)
 
     def neighbours(self, axis: int, away: int) -> tuple[mi.UInt32, mi.UInt32]:
-        """The pixels ``away`` after and before each along an axis; itself beyond the border of the image."""
+        """The pixels ``away`` after and before each along an axis; itself beyond the border of the
+        image."""
         i, (place, stride) = self._index, self._axes[axis]
         after = dr.select(place + away < self.rows, i + away * stride, i)
         return after, dr.select(place >= away, i - away * stride, i)

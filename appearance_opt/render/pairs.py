@@ -1,22 +1,25 @@
 """The derivative of visibility, another way: pair antialiasing.
 
-Where neighbouring samples see different surfaces, the boundary between their centres is looked for, and where it
-crosses the segment between them decides how much of the one is blended into the pixel of the other:
+Where neighbouring samples see different surfaces, the boundary between their centres is looked for,
+and where it crosses the segment between them decides how much of the one is blended into the pixel
+of the other:
 
     d < 1/2:  I(front) += (1/2 - d) (c_back - c_front),        d > 1/2:  I(back) += (d - 1/2) (c_front - c_back),
 
-with d the distance of the crossing from the front sample, in units of the samples' distance (Laine et al. 2020,
-Modular Primitives for High-Performance Differentiable Rendering, section 3.6). Pairs beside each other look at
-boundaries steeper than 45 degrees only, pairs above each other at the flatter ones: each counts once. Either way
-dI/dd = c_front - c_back, so that a pair is one silhouette point, in the middle of the edge's piece between two rows
-of samples, of that piece's length: the backward pass is that of ``silhouette``. The gradient is that of the blended
-image, to rounding.
+with d the distance of the crossing from the front sample, in units of the samples' distance (Laine
+et al. 2020, Modular Primitives for High-Performance Differentiable Rendering, section 3.6). Pairs
+beside each other look at boundaries steeper than 45 degrees only, pairs above each other at the
+flatter ones: each counts once. Either way dI/dd = c_front - c_back, so that a pair is one
+silhouette point, in the middle of the edge's piece between two rows of samples, of that piece's
+length: the backward pass is that of ``silhouette``. The gradient is that of the blended image, to
+rounding.
 
-Two things go beyond the paper. We do not stop at the triangle that the front sample sees but walk on over the mesh to
-the silhouette (``walk``), since triangles beside an outline are seen edge-on and thinner than a pixel. And where two
-sheets both cover both samples they run into each other, which is a boundary without an edge
-(``intersections``). What lies between the samples without being seen by one of them is missed
-still: the gradient is too short where parts are thinner than the samples' distance.
+Two things go beyond the paper. We do not stop at the triangle that the front sample sees but walk
+on over the mesh to the silhouette (``walk``), since triangles beside an outline are seen edge-on
+and thinner than a pixel. And where two sheets both cover both samples they run into each other,
+which is a boundary without an edge (``intersections``). What lies between the samples without being
+seen by one of them is missed still: the gradient is too short where parts are thinner than the
+samples' distance.
 """
 
 from __future__ import annotations
@@ -48,7 +51,8 @@ if TYPE_CHECKING:
 class Pairs:
     """What pairs do to a batch. ``edges``, ``intersections``: the boundaries, ``inside`` the front
     samples and ``pixel`` the pixel that changes. Of all of them: ``receiver``, the index of the
-    sample in that pixel; ``pixel``; ``giver``, the other sample; ``weight``, its share in [0, 1/2]."""
+    sample in that pixel; ``pixel``; ``giver``, the other sample; ``weight``, its share in [0,
+    1/2]."""
 
     edges: EdgeSamples | None
     intersections: Intersections | None
@@ -60,8 +64,8 @@ class Pairs:
 
 @dataclass
 class Paired:
-    """A batch with pairs: the rays that are ``averaged``, those that are ``deferred``, the pixels that pairs changed
-    (``crossed``), and the moving boundaries."""
+    """A batch with pairs: the rays that are ``averaged``, those that are ``deferred``, the pixels
+    that pairs changed (``crossed``), and the moving boundaries."""
 
     averaged: Weighted | None
     deferred: Whole | None
@@ -96,8 +100,9 @@ def paired_samples(
     defer: bool,
     run: Run = traced,
 ) -> Paired:
-    """Camera rays on a regular grid, with what pairs move between pixels. Pixels of a single ray that no pair changes
-    are deferred with ``defer``. No gradients. ``edges`` must be ``walkable``; ``run``: see ``freezing``."""
+    """Camera rays on a regular grid, with what pairs move between pixels. Pixels of a single ray
+    that no pair changes are deferred with ``defer``. No gradients. ``edges`` must be ``walkable``;
+    ``run``: see ``freezing``."""
     assert edges.around is not None, "pairs walk over the mesh: use LatentTopology.walkable"
     per_axis = isqrt(quality.samples)
     fine = _Fine(grid.finer(per_axis), grid, per_axis)
@@ -126,8 +131,9 @@ def find_intersections(
     per_axis: int,
     run: Run = traced,
 ) -> Intersections | None:
-    """Where surfaces run into each other, found between ``per_axis`` squared rays in every pixel, and nothing else of
-    what pairs find: for other estimators of the derivative at silhouettes. None without any."""
+    """Where surfaces run into each other, found between ``per_axis`` squared rays in every pixel,
+    and nothing else of what pairs find: for other estimators of the derivative at silhouettes. None
+    without any."""
     fine = _Fine(grid.finer(per_axis), grid, per_axis)
     s = fine.samples
     hits, depth = run(_middles, scene, records, s.view, s.column, s.row, s.size)
@@ -137,16 +143,27 @@ def find_intersections(
 
 
 def _middles(
-    scene: Scene, records: mi.Float, view: mi.UInt32, column: mi.UInt32, row: mi.UInt32, size: mi.Float
+    scene: Scene,
+    records: mi.Float,
+    view: mi.UInt32,
+    column: mi.UInt32,
+    row: mi.UInt32,
+    size: mi.Float,
 ) -> tuple[Samples, mi.Float]:
     """What the rays through the middles of all pixels hit, and the depth of the hits."""
     return rays.trace_depth(scene, records, view, mi.Float(column) + 0.5, mi.Float(row) + 0.5, size)
 
 
 def _weights(
-    hits: Samples, received: mi.Float, found: Pairs | None, fine: _Fine, quality: Quality, defer: bool
+    hits: Samples,
+    received: mi.Float,
+    found: Pairs | None,
+    fine: _Fine,
+    quality: Quality,
+    defer: bool,
 ) -> tuple[Weighted | None, Whole | None]:
-    """Every covered sample in its own pixel, less what it receives, and the givers in the pixels of the receivers."""
+    """Every covered sample in its own pixel, less what it receives, and the givers in the pixels of
+    the receivers."""
     own = rays.keep(hits, dr.compress(hits.triangle != MISS))
     if dr.width(own.triangle) == 0:
         return None, None
@@ -157,7 +174,9 @@ def _weights(
         alone = dr.compress(share == 0)
         if dr.width(alone):
             points = rays.keep(own, alone)
-            deferred = Whole([points], pixel_index(points, rows), dr.opaque(mi.Float, quality.point_width))
+            deferred = Whole(
+                [points], pixel_index(points, rows), dr.opaque(mi.Float, quality.point_width)
+            )
         changed = dr.compress(share > 0)
         own, share = rays.keep(own, changed), dr.gather(mi.Float, share, changed)
     parts = []
@@ -167,14 +186,22 @@ def _weights(
     given = dr.compress(found.giver.triangle != MISS) if found is not None else mi.UInt32()
     if found is not None and dr.width(given):
         giver = fine.coarse(rays.keep(found.giver, given))
-        parts.append((giver, dr.gather(mi.UInt32, found.pixel, given), dr.gather(mi.Float, found.weight, given)))
+        parts.append(
+            (
+                giver,
+                dr.gather(mi.UInt32, found.pixel, given),
+                dr.gather(mi.Float, found.weight, given),
+            )
+        )
     if not parts:
         return None, deferred
     samples, pixels, weights = zip(*parts, strict=True)
     every, pixel = concat(list(samples)), join_arrays(list(pixels))
     weight = join_arrays(list(weights)) * dr.opaque(mi.Float, 1 / quality.samples)
     dr.eval(every, pixel, weight)
-    return Weighted(every, pixel, weight, dr.opaque(mi.Float, quality.sample_width / fine.per_axis)), deferred
+    return Weighted(
+        every, pixel, weight, dr.opaque(mi.Float, quality.sample_width / fine.per_axis)
+    ), deferred
 
 
 def find_pairs(
@@ -194,8 +221,11 @@ def find_pairs(
     edge, covers = run(walk, edges, vertices, records, every, size)
     kept = dr.compress(edge != MISS)
     outlines = [(every.keep(kept), dr.gather(mi.UInt32, edge, kept))]
-    # the front sheet goes on under the back sample without being seen there: the back sheet lies before it
-    under = dr.compress((covers != MISS) & (every.back.triangle != MISS) & (covers != every.back.triangle))
+    # the front sheet goes on under the back sample without being seen there: the back sheet lies
+    # before it
+    under = dr.compress(
+        (covers != MISS) & (every.back.triangle != MISS) & (covers != every.back.triangle)
+    )
     met = None
     if dr.width(under):
         other = every.keep(under).swapped()
@@ -212,14 +242,19 @@ def find_pairs(
         pairs, edge = (
             outlines[0]
             if len(outlines) == 1
-            else (outlines[0][0].join(outlines[1][0]), join_arrays([outlines[0][1], outlines[1][1]]))
+            else (
+                outlines[0][0].join(outlines[1][0]),
+                join_arrays([outlines[0][1], outlines[1][1]]),
+            )
         )
         points, d = _outline_points(edges, vertices, records, edge, pairs, fine)
         points.pixel, *blended = _blend(pairs, d, fine)
         parts.append((points.pixel, *blended))
     if met is not None:
         met.area = dr.opaque(mi.Float, 1 / fine.per_axis**2)
-        met.pixel, *blended = _blend(Neighbours(met.inside, met.outside, met.horizontal), met.position, fine)
+        met.pixel, *blended = _blend(
+            Neighbours(met.inside, met.outside, met.horizontal), met.position, fine
+        )
         parts.append((met.pixel, *blended))
         met.inside, met.outside = fine.coarse(met.inside), fine.coarse(met.outside)
         dr.eval(met)
@@ -229,8 +264,11 @@ def find_pairs(
     return Pairs(points, met, receiver, pixel, concat([p[3] for p in parts]), weight)
 
 
-def _blend(pairs: Neighbours, d: mi.Float, fine: _Fine) -> tuple[mi.UInt32, mi.UInt32, mi.Float, Samples]:
-    """(pixel that changes, index of its sample, share of the other sample, that sample) for crossings at ``d``."""
+def _blend(
+    pairs: Neighbours, d: mi.Float, fine: _Fine
+) -> tuple[mi.UInt32, mi.UInt32, mi.Float, Samples]:
+    """(pixel that changes, index of its sample, share of the other sample, that sample) for
+    crossings at ``d``."""
     in_front = d < 0.5
     receiver = choose(in_front, pairs.front, pairs.back)
     out = (
@@ -244,9 +282,15 @@ def _blend(pairs: Neighbours, d: mi.Float, fine: _Fine) -> tuple[mi.UInt32, mi.U
 
 
 def _outline_points(
-    edges: EdgeList, vertices: mi.Float, records: mi.Float, edge: mi.UInt32, pairs: Neighbours, fine: _Fine
+    edges: EdgeList,
+    vertices: mi.Float,
+    records: mi.Float,
+    edge: mi.UInt32,
+    pairs: Neighbours,
+    fine: _Fine,
 ) -> tuple[EdgeSamples, mi.Float]:
-    """(silhouette points without their pixels, distances from the front samples): where ``edge`` crosses segments."""
+    """(silhouette points without their pixels, distances from the front samples): where ``edge``
+    crosses segments."""
     front, back, horizontal = pairs.front, pairs.back, pairs.horizontal
     ends = dr.gather(mi.ArrayXu, edges.packets, edge, shape=(4, dr.width(edge)))
     camera, size = rays.camera_of(records, front.view), fine.samples.size

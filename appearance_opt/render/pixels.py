@@ -12,8 +12,8 @@ from appearance_opt.render.rays import Samples
 class Grid:
     """The pixels of a batch of square images, on the device, tile by tile (see ``rays.TILE``).
 
-    ``size``, ``rows``: the resolution as opaque numbers, so that another one compiles no new kernel.
-    ``view``, ``column``, ``row``: of every pixel. Made once and reused by every step.
+    ``size``, ``rows``: the resolution as opaque numbers, so that another one compiles no new
+    kernel. ``view``, ``column``, ``row``: of every pixel. Made once and reused by every step.
     """
 
     def __init__(self, views: int, resolution: int) -> None:
@@ -26,7 +26,8 @@ class Grid:
         self._finer: dict[int, Grid] = {}
 
     def finer(self, factor: int) -> Grid:
-        """``factor`` squared points in every pixel, as a grid of their own; made when first asked for."""
+        """``factor`` squared points in every pixel, as a grid of their own; made when first asked
+        for."""
         if factor == 1:
             return self
         if factor not in self._finer:

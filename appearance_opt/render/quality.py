@@ -1,4 +1,5 @@
-"""How finely a batch of images is sampled, and by what estimator silhouettes get their gradients."""
+"""How finely a batch of images is sampled, and by what estimator silhouettes get their
+gradients."""
 
 from __future__ import annotations
 
@@ -12,12 +13,14 @@ VISIBILITY = ("edges", "pairs", "none")
 class Quality:
     """How visibility is sampled, and how its derivative is found.
 
-    ``visibility``: "edges" (``silhouette``), "pairs" (``pairs``), or "none" (silhouettes have no gradient).
-    ``edge_density``: silhouette points per pixel of silhouette (0: none); ``edge_samples``: camera rays in each
-    pixel that a silhouette crosses; both for "edges" only. ``samples``: rays in all (other) pixels; for "pairs" a
-    square number, as neighbours are compared on a regular grid. ``sample_width``, ``point_width``: texture filter
-    in pixels of a pixel that is averaged, and of one that is a single point. ``intersections``: "edges" follow surfaces
-    that run into each other, too, as pairs always do, by comparing neighbouring rays (price: docs/accuracy.md).
+    ``visibility``: "edges" (``silhouette``), "pairs" (``pairs``), or "none" (silhouettes have no
+    gradient). ``edge_density``: silhouette points per pixel of silhouette (0: none);
+    ``edge_samples``: camera rays in each pixel that a silhouette crosses; both for "edges" only.
+    ``samples``: rays in all (other) pixels; for "pairs" a square number, as neighbours are compared
+    on a regular grid. ``sample_width``, ``point_width``: texture filter in pixels of a pixel that
+    is averaged, and of one that is a single point. ``intersections``: "edges" follow surfaces that
+    run into each other, too, as pairs always do, by comparing neighbouring rays (price:
+    docs/accuracy.md).
     """
 
     edge_density: float = 1.0

@@ -1,10 +1,11 @@
 """Primary visibility without rays: triangles are drawn onto the pixels.
 
-Every triangle visits its pixels, row by row. Where it covers the sample, the bits of its depth and its number go into
-the image as one number of 64 bits, of which the least stays: that of the nearest triangle. Edge functions are
-homogeneous (Olano and Greer 1997, Triangle Scan Conversion using 2D Homogeneous Coordinates), so that triangles that
-cross the plane of the camera need no clipping. Needs no BVH, and less time than tracing rays on a CPU with fewer than
-``MOST_PER_PIXEL`` triangles to a pixel (docs/performance.md).
+Every triangle visits its pixels, row by row. Where it covers the sample, the bits of its depth and
+its number go into the image as one number of 64 bits, of which the least stays: that of the nearest
+triangle. Edge functions are homogeneous (Olano and Greer 1997, Triangle Scan Conversion using 2D
+Homogeneous Coordinates), so that triangles that cross the plane of the camera need no clipping.
+Needs no BVH, and less time than tracing rays on a CPU with fewer than ``MOST_PER_PIXEL`` triangles
+to a pixel (docs/performance.md).
 """
 
 from __future__ import annotations
@@ -26,16 +27,19 @@ MOST_PER_PIXEL = 4
 """Triangles per pixel from which rays are faster."""
 
 LANES = 1 << 16
-"""Triangles of small meshes are shared by several threads, which take turns in their rows, up to this many in all."""
+"""Triangles of small meshes are shared by several threads, which take turns in their rows, up to
+this many in all."""
 
 SLACK = 1e-6
-"""Rounding of edge functions, in parts of the sum of their terms: no sample falls between two triangles."""
+"""Rounding of edge functions, in parts of the sum of their terms: no sample falls between two
+triangles."""
 
 NOTHING = 0xFFFFFFFFFFFFFFFF
 
 
 def drawing_is_faster(surface: Surface, grid: Grid) -> bool:
-    """Is drawing the surface faster than tracing rays? Not known of GPUs, which have hardware for rays."""
+    """Is drawing the surface faster than tracing rays? Not known of GPUs, which have hardware for
+    rays."""
     triangles = dr.width(surface.faces) // 4
     return mi.variant() == backend.CPU and triangles <= MOST_PER_PIXEL * grid.resolution**2
 
@@ -55,10 +59,10 @@ def visible(
     pixels: int,
     culled: mi.Bool | None = None,
 ) -> tuple[Samples, mi.Float]:
-    """What the surface shows at the offset (dx, dy) in pixels (view, column, row), and its depth (see
-    ``rays.trace_depth``). ``vertices``, ``faces``: packets of ``Surface``; ``size``, ``rows``: see ``Grid``;
-    ``pixels`` of all ``views``; ``culled``: see ``Surface``. Of triangles at exactly the same depth the first is
-    seen."""
+    """What the surface shows at the offset (dx, dy) in pixels (view, column, row), and its depth
+    (see ``rays.trace_depth``). ``vertices``, ``faces``: packets of ``Surface``; ``size``, ``rows``:
+    see ``Grid``; ``pixels`` of all ``views``; ``culled``: see ``Surface``. Of triangles at exactly
+    the same depth the first is seen."""
     projected = _project(vertices, records, views, size)
     dr.eval(projected)
     image = _draw(projected, faces, views, rows, pixels, dx, dy, culled)
@@ -98,7 +102,8 @@ def _draw(
     dy: mi.Float,
     culled: mi.Bool | None,
 ) -> mi.UInt64:
-    """(pixels,) the bits of the nearest depth, above the number of the triangle there; ``NOTHING`` where none is."""
+    """(pixels,) the bits of the nearest depth, above the number of the triangle there; ``NOTHING``
+    where none is."""
     triangles, stride = dr.width(faces) // 4, dr.width(projected) // 4 // views
     shares = max(1, min(16, LANES // max(views * triangles, 1)))
     count = views * triangles * shares
@@ -107,7 +112,10 @@ def _draw(
     view = drawn // triangles
     triangle = drawn - view * triangles
     face = dr.gather(mi.ArrayXu, faces, triangle, shape=(4, count))
-    p = [dr.gather(mi.ArrayXf, projected, view * stride + face[k], shape=(4, count)) for k in range(3)]
+    p = [
+        dr.gather(mi.ArrayXf, projected, view * stride + face[k], shape=(4, count))
+        for k in range(3)
+    ]
     (x0, x1), (y0, y1), somewhere = _bounds(p, dx, dy, mi.Float(rows) - 1)
     # seen from the first pixel: numbers are small there, and keep their digits
     v = [mi.Vector3f(q[0] - (x0 + dx) * q[2], q[1] - (y0 + dy) * q[2], q[2]) for q in p]
@@ -118,7 +126,9 @@ def _draw(
         somewhere &= (volume < 0) | ~dr.gather(mi.Bool, culled, triangle)
     edges = [dr.select(volume < 0, -e, e) for e in edges]
     wide, high = x1 - x0, y1 - y0
-    slack = [-SLACK * (dr.abs(e.x) * (wide + 1) + dr.abs(e.y) * (high + 1) + dr.abs(e.z)) for e in edges]
+    slack = [
+        -SLACK * (dr.abs(e.x) * (wide + 1) + dr.abs(e.y) * (high + 1) + dr.abs(e.z)) for e in edges
+    ]
     whole, volume = edges[0] + edges[1] + edges[2], dr.abs(volume)
     image = dr.full(mi.UInt64, NOTHING, pixels)
 
@@ -138,7 +148,9 @@ def _draw(
         covered = drawing & (x <= end) & (inverse > 0)
         for e, least in zip(edges, slack, strict=True):
             covered &= dr.fma(e.x, x, dr.fma(e.y, y, e.z)) >= least
-        key = (mi.UInt64(dr.reinterpret_array(mi.UInt32, volume / inverse)) << 32) | mi.UInt64(triangle)
+        key = (mi.UInt64(dr.reinterpret_array(mi.UInt32, volume / inverse)) << 32) | mi.UInt64(
+            triangle
+        )
         pixel = (view * rows + mi.UInt32(y0 + y)) * rows + mi.UInt32(x0 + x)
         dr.scatter_reduce(dr.ReduceOp.Min, image, key, pixel, covered)
         after = x + 1 > end
@@ -156,8 +168,9 @@ def _draw(
 def _bounds(
     p: list[mi.ArrayXf], dx: mi.Float, dy: mi.Float, last: mi.Float
 ) -> tuple[tuple[mi.Float, mi.Float], tuple[mi.Float, mi.Float], mi.Bool]:
-    """((first, last column), (first, last row), is there any?) of the pixels up to number ``last`` that triangles may
-    cover: all if a vertex is behind the camera, none if all are. ``p``: packets of ``_project``."""
+    """((first, last column), (first, last row), is there any?) of the pixels up to number ``last``
+    that triangles may cover: all if a vertex is behind the camera, none if all are. ``p``: packets
+    of ``_project``."""
     behind = [q[2] <= 0 for q in p]
     crossing = behind[0] | behind[1] | behind[2]
 

@@ -12,8 +12,8 @@ from appearance_opt.render.rays import Samples
 
 @dataclass
 class Weighted:
-    """Covered camera rays, the ``pixel`` of each and its ``weight`` there, and their ``width`` in pixels, which selects
-    mip levels."""
+    """Covered camera rays, the ``pixel`` of each and its ``weight`` there, and their ``width`` in
+    pixels, which selects mip levels."""
 
     samples: Samples
     pixel: mi.UInt32
@@ -23,8 +23,8 @@ class Weighted:
 
 @dataclass
 class Whole:
-    """Pixels all of whose camera rays are covered: the first ray of every ``pixel``, the second, and so on, each worth
-    the same, and their ``width`` in pixels."""
+    """Pixels all of whose camera rays are covered: the first ray of every ``pixel``, the second,
+    and so on, each worth the same, and their ``width`` in pixels."""
 
     rays: list[Samples]
     pixel: mi.UInt32
@@ -35,12 +35,14 @@ def concat(parts: list[Samples]) -> Samples:
     """Lists of samples one after the other."""
     if len(parts) == 1:
         return parts[0]
-    return Samples(*(join_arrays([getattr(p, f) for p in parts]) for f in ("view", "x", "y", "triangle")))
+    return Samples(
+        *(join_arrays([getattr(p, f) for p in parts]) for f in ("view", "x", "y", "triangle"))
+    )
 
 
 def join_arrays(parts: list[mi.Float]) -> mi.Float:
-    """Arrays one after the other. ``dr.concat`` would write their widths, which change every step, into the
-    kernel and so compile one every step."""
+    """Arrays one after the other. ``dr.concat`` would write their widths, which change every step,
+    into the kernel and so compile one every step."""
     out = dr.empty(type(parts[0]), sum(dr.width(p) for p in parts))
     offset = 0
     for part in parts:

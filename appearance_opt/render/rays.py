@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     from appearance_opt.render.passing import Scene
 
 TILE = 4
-"""Rays are ordered in tiles of 4 x 4 pixels: neighbours in the wavefront are neighbours in the image,
-which makes tracing 30 % faster than scan lines (measured)."""
+"""Rays are ordered in tiles of 4 x 4 pixels: neighbours in the wavefront are neighbours in the
+image, which makes tracing 30 % faster than scan lines (measured)."""
 
 
 @dataclass
@@ -81,10 +81,16 @@ def pixel_grid(views: int, resolution: int) -> tuple[mi.UInt32, mi.UInt32, mi.UI
     if resolution % TILE == 0:
         return view, column, row
     keep = dr.compress((column < resolution) & (row < resolution))
-    return dr.gather(mi.UInt32, view, keep), dr.gather(mi.UInt32, column, keep), dr.gather(mi.UInt32, row, keep)
+    return (
+        dr.gather(mi.UInt32, view, keep),
+        dr.gather(mi.UInt32, column, keep),
+        dr.gather(mi.UInt32, row, keep),
+    )
 
 
-def trace(scene: Scene, records: mi.Float, view: mi.UInt32, x: mi.Float, y: mi.Float, resolution: mi.Float) -> Samples:
+def trace(
+    scene: Scene, records: mi.Float, view: mi.UInt32, x: mi.Float, y: mi.Float, resolution: mi.Float
+) -> Samples:
     """What camera rays through pixel positions (x, y) of the given views see."""
     return trace_depth(scene, records, view, x, y, resolution)[0]
 
@@ -111,13 +117,15 @@ def trace_pixels(
     resolution: mi.Float,
     run: Run = traced,
 ) -> tuple[Samples, mi.Bool]:
-    """``count`` rays in each of the pixels at the positions ``index`` of (view, column, row), those of a pixel one
-    after the other, and whether each hits."""
+    """``count`` rays in each of the pixels at the positions ``index`` of (view, column, row), those
+    of a pixel one after the other, and whether each hits."""
     if dr.width(index) == 0:
         return Samples(mi.UInt32(), mi.Float(), mi.Float(), mi.UInt32()), mi.Bool()
     ray = dr.arange(mi.UInt32, dr.width(index) * count)
     dr.eval(ray)  # its length varies: it is no part of what is recorded
-    fine, covered = run(_in_pixels, scene, records, view, column, row, index, ray, count, resolution)
+    fine, covered = run(
+        _in_pixels, scene, records, view, column, row, index, ray, count, resolution
+    )
     dr.eval(fine, covered)  # or the mask and the triangles would each trace them
     return fine, covered
 
@@ -133,13 +141,17 @@ def _in_pixels(
     count: int,
     resolution: mi.Float,
 ) -> tuple[Samples, mi.Bool]:
-    """What each ray hits, and whether it hits: ``ray`` counts through ``count`` rays in every pixel."""
+    """What each ray hits, and whether it hits: ``ray`` counts through ``count`` rays in every
+    pixel."""
     k = ray // count
     at = dr.gather(mi.UInt32, index, k)
     odd = 2 * (ray - k * count) + 1  # as in ``sub_pixel_offsets``
     scale = 1 / (2 * count)
     x = mi.Float(dr.gather(mi.UInt32, column, at)) + mi.Float(odd) * scale
-    y = mi.Float(dr.gather(mi.UInt32, row, at)) + mi.Float(odd * _generator(count) % (2 * count)) * scale
+    y = (
+        mi.Float(dr.gather(mi.UInt32, row, at))
+        + mi.Float(odd * _generator(count) % (2 * count)) * scale
+    )
     hits = trace(scene, records, dr.gather(mi.UInt32, view, at), x, y, resolution)
     return hits, hits.triangle != MISS
 
@@ -156,14 +168,18 @@ def keep(samples: Samples, index: mi.UInt32) -> Samples:
 
 @cache
 def sub_pixel_offsets(count: int) -> np.ndarray:
-    """(count, 2) well-spread positions in the unit square: the rank-1 lattice (i, g i) / count whose points
-    lie farthest apart (on the torus), placed so that it is symmetric about the middle of the pixel.
+    """(count, 2) well-spread positions in the unit square: the rank-1 lattice (i, g i) / count
+    whose points lie farthest apart (on the torus), placed so that it is symmetric about the middle
+    of the pixel.
 
-    Without the symmetry the image is shifted by the distance of the points' mean from the middle: by a
-    tenth of a pixel for 16 points of the R2 sequence, which biases silhouette gradients by 10 %.
+    Without the symmetry the image is shifted by the distance of the points' mean from the middle:
+    by a tenth of a pixel for 16 points of the R2 sequence, which biases silhouette gradients by 10
+    %.
     """
     odd = 2 * np.arange(count) + 1
-    points = (np.stack([odd, odd * _generator(count) % (2 * count)], 1) / (2 * count)).astype(np.float32)
+    points = (np.stack([odd, odd * _generator(count) % (2 * count)], 1) / (2 * count)).astype(
+        np.float32
+    )
     points.setflags(write=False)
     return points
 

@@ -20,8 +20,8 @@ LONGEST = 32
 
 @dataclass
 class Neighbours:
-    """Samples beside each other (``horizontal``) or above each other that see different triangles: ``front`` the
-    nearer one, by depth, and ``back``."""
+    """Samples beside each other (``horizontal``) or above each other that see different triangles:
+    ``front`` the nearer one, by depth, and ``back``."""
 
     front: Samples
     back: Samples
@@ -39,7 +39,9 @@ class Neighbours:
     def join(self, other: Neighbours) -> Neighbours:
         """Both lists, one after the other."""
         horizontal = join_arrays([mi.UInt32(self.horizontal), mi.UInt32(other.horizontal)]) == 1
-        return Neighbours(concat([self.front, other.front]), concat([self.back, other.back]), horizontal)
+        return Neighbours(
+            concat([self.front, other.front]), concat([self.back, other.back]), horizontal
+        )
 
     @property
     def width(self) -> int:
@@ -47,11 +49,17 @@ class Neighbours:
 
 
 def neighbours(hits: Samples, depth: mi.Float, fine: Grid) -> Neighbours | None:
-    """All neighbours among ``hits``, one in every pixel of ``fine``, that see different triangles. None without."""
+    """All neighbours among ``hits``, one in every pixel of ``fine``, that see different triangles.
+    None without."""
     index = pixel_index(hits, fine.rows)
     triangles, depths = dr.empty(mi.UInt32, fine.pixels), dr.empty(mi.Float, fine.pixels)
     dr.scatter(triangles, hits.triangle, index, mode=dr.ReduceMode.Permute)
-    dr.scatter(depths, dr.select(hits.triangle == MISS, mi.Float(NOTHING), depth), index, mode=dr.ReduceMode.Permute)
+    dr.scatter(
+        depths,
+        dr.select(hits.triangle == MISS, mi.Float(NOTHING), depth),
+        index,
+        mode=dr.ReduceMode.Permute,
+    )
     dr.eval(triangles, depths)
     found = []
     for horizontal in (True, False):
@@ -77,28 +85,38 @@ def neighbours(hits: Samples, depth: mi.Float, fine: Grid) -> Neighbours | None:
 
 def choose(condition: mi.Bool, one: Samples, other: Samples) -> Samples:
     """``one`` where the condition holds, else ``other``, of the same views."""
-    fields = [dr.select(condition, getattr(one, f), getattr(other, f)) for f in ("x", "y", "triangle")]
+    fields = [
+        dr.select(condition, getattr(one, f), getattr(other, f)) for f in ("x", "y", "triangle")
+    ]
     return Samples(one.view, *fields)
 
 
 def walk(
     edges: EdgeList, vertices: mi.Float, records: mi.Float, pairs: Neighbours, resolution: mi.Float
 ) -> tuple[mi.UInt32, mi.UInt32]:
-    """(silhouette edge, triangle): where the lines from front to back samples leave the sheet that the front sample
-    sees. From triangle to triangle, each left by the last of its edges along the line. Either a silhouette is
-    met before the back sample, which is an edge if it is one of this kind of pair's (steeper than 45 degrees for those
-    beside each other, flatter for the others), or the sheet covers the back sample, with that triangle; what is not
-    there is MISS."""
+    """(silhouette edge, triangle): where the lines from front to back samples leave the sheet that
+    the front sample sees. From triangle to triangle, each left by the last of its edges along the
+    line. Either a silhouette is met before the back sample, which is an edge if it is one of this
+    kind of pair's (steeper than 45 degrees for those beside each other, flatter for the others), or
+    the sheet covers the back sample, with that triangle; what is not there is MISS."""
     around, packets = edges.around, edges.packets
     front, back, horizontal = pairs.front, pairs.back, pairs.horizontal
     count = pairs.width
-    start_along, line = dr.select(horizontal, front.x, front.y), dr.select(horizontal, front.y, front.x)
+    start_along, line = (
+        dr.select(horizontal, front.x, front.y),
+        dr.select(horizontal, front.y, front.x),
+    )
     sign = dr.select(horizontal, back.x - front.x, back.y - front.y)
 
-    def visit(face: mi.UInt32, walking: mi.Bool, steps: mi.UInt32, found: mi.UInt32, covers: mi.UInt32) -> tuple:
+    def visit(
+        face: mi.UInt32, walking: mi.Bool, steps: mi.UInt32, found: mi.UInt32, covers: mi.UInt32
+    ) -> tuple:
         here = dr.gather(mi.ArrayXu, around, face, walking, shape=(12, count))
         camera = rays.camera_of(records, front.view)
-        projected = [silhouette.project(camera, silhouette.position(vertices, here[k]), resolution) for k in range(3)]
+        projected = [
+            silhouette.project(camera, silhouette.position(vertices, here[k]), resolution)
+            for k in range(3)
+        ]
         walking &= (projected[0][2] > 0) & (projected[1][2] > 0) & (projected[2][2] > 0)
         along = [dr.select(horizontal, p[0], p[1]) for p in projected]
         across = [dr.select(horizontal, p[1], p[0]) for p in projected]
@@ -114,19 +132,29 @@ def walk(
             furthest, leaves = dr.select(last, t, furthest), dr.select(last, here[4 + k], leaves)
             beyond = dr.select(last, here[8 + k], beyond)
             # at 45 degrees the edge belongs to the pairs beside each other
-            ours = dr.select(last, dr.select(horizontal, run <= dr.abs(rise), run < dr.abs(rise)), ours)
+            ours = dr.select(
+                last, dr.select(horizontal, run <= dr.abs(rise), run < dr.abs(rise)), ours
+            )
         walking &= leaves != MISS
         covers = dr.select(walking & (furthest > 1), face, covers)
         walking &= furthest <= 1
         edge = dr.gather(mi.ArrayXu, packets, leaves, walking, shape=(4, count))
         a, b = silhouette.position(vertices, edge[0]), silhouette.position(vertices, edge[1])
-        ends = walking & silhouette.is_silhouette(edges, dr.select(walking, leaves, 0), edge, a, b, vertices, camera)
+        ends = walking & silhouette.is_silhouette(
+            edges, dr.select(walking, leaves, 0), edge, a, b, vertices, camera
+        )
         found = dr.select(ends & ours, leaves, found)
         walking &= ~ends
         return dr.select(walking, beyond, face), walking, steps + 1, found, covers
 
     nothing = dr.full(mi.UInt32, MISS, count)
-    start = (mi.UInt32(front.triangle), front.triangle != MISS, dr.zeros(mi.UInt32, count), nothing, mi.UInt32(nothing))
+    start = (
+        mi.UInt32(front.triangle),
+        front.triangle != MISS,
+        dr.zeros(mi.UInt32, count),
+        nothing,
+        mi.UInt32(nothing),
+    )
     state = dr.while_loop(start, lambda _, walking, steps, *__: walking & (steps < LONGEST), visit)
     dr.eval(state[3], state[4])
     return state[3], state[4]

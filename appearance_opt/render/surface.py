@@ -11,17 +11,17 @@ from appearance_opt.render.math import at_least, at_most, clamp, unit
 from appearance_opt.render.rays import Camera, Samples, direction
 
 GRAZING_COSINE = 0.2
-"""Mip levels are chosen as if no surface were seen at a flatter angle than this: isotropic lookups at
-grazing angles would otherwise blur everything along the short axis of the footprint, too."""
+"""Mip levels are chosen as if no surface were seen at a flatter angle than this: isotropic lookups
+at grazing angles would otherwise blur everything along the short axis of the footprint, too."""
 
 EDGE_ON_COSINE = 0.05
-"""Surfaces seen at a flatter angle pass on less of the derivative of the place that a ray hits, in proportion. It grows
-with the inverse of the cosine while the chance of a ray to hit falls with the cosine: the few that do would drown all
-others in noise."""
+"""Surfaces seen at a flatter angle pass on less of the derivative of the place that a ray hits, in
+proportion. It grows with the inverse of the cosine while the chance of a ray to hit falls with the
+cosine: the few that do would drown all others in noise."""
 
 SLACK = 0.1
-"""How far barycentric coordinates may lie outside of the triangle that was hit: rounding of healthy triangles moves
-them by 1e-3 at most, and gradients end at the bounds."""
+"""How far barycentric coordinates may lie outside of the triangle that was hit: rounding of healthy
+triangles moves them by 1e-3 at most, and gradients end at the bounds."""
 
 
 @dataclass
@@ -30,10 +30,11 @@ class Surface:
 
     ``faces`` (4 F): three vertex indices and a material index. ``vertices`` (8 V): position, 0,
     normal, 0. ``corners`` (4 F): three indices into ``frames`` and 0, or None where they equal the
-    vertex indices. ``frames`` (8 R): u, v, handedness, 0, tangent, 0; or (2 R): u, v without a normal
-    map (``has_tangents`` is False then); or None without texture coordinates. ``colors`` (4 V): linear
-    vertex colour, alpha, or None. ``vertices`` and ``frames`` may carry gradients. ``culled`` (F,): faces that are not
-    to be seen from behind (see ``asset.sides.culled``), or None without any.
+    vertex indices. ``frames`` (8 R): u, v, handedness, 0, tangent, 0; or (2 R): u, v without a
+    normal map (``has_tangents`` is False then); or None without texture coordinates. ``colors`` (4
+    V): linear vertex colour, alpha, or None. ``vertices`` and ``frames`` may carry gradients.
+    ``culled`` (F,): faces that are not to be seen from behind (see ``asset.sides.culled``), or None
+    without any.
     """
 
     faces: mi.UInt32
@@ -49,8 +50,8 @@ class Surface:
 class Hit:
     """What the shader needs at each sample. Directions are unit vectors in world space.
 
-    ``footprint``: area of the sample in UV space, detached. ``handedness``: sign of the bitangent. ``color``,
-    ``alpha``: of the vertices.
+    ``footprint``: area of the sample in UV space, detached. ``handedness``: sign of the bitangent.
+    ``color``, ``alpha``: of the vertices.
     """
 
     position: mi.Point3f
@@ -65,13 +66,15 @@ class Hit:
     alpha: mi.Float | None = None
 
 
-def interpolate(surface: Surface, camera: Camera, samples: Samples, resolution: mi.Float, width: mi.Float) -> Hit:
+def interpolate(
+    surface: Surface, camera: Camera, samples: Samples, resolution: mi.Float, width: mi.Float
+) -> Hit:
     """Attributes where the camera rays of ``samples`` (all hits) meet their triangles.
 
     Barycentric coordinates are recomputed from the vertex positions (Moeller and Trumbore 1997), so
-    that gradients flow to the positions: the ray stands still, the surface moves under it. ``width``:
-    width of a sample in pixels. The normal is turned towards the viewer when the back of the triangle
-    is seen.
+    that gradients flow to the positions: the ray stands still, the surface moves under it.
+    ``width``: width of a sample in pixels. The normal is turned towards the viewer when the back of
+    the triangle is seen.
     """
     face, rows = _triangle(surface, samples.triangle)
     p = [mi.Point3f(r[0], r[1], r[2]) for r in rows]
@@ -99,8 +102,8 @@ def interpolate(surface: Surface, camera: Camera, samples: Samples, resolution: 
     pixel = depth * (2 * width / resolution) * dr.norm(camera.right)
     area = dr.square(pixel) / at_least(dr.abs(cosine), GRAZING_COSINE)
     _attributes(hit, surface, samples.triangle, face, rows, b1, b2, facing, area)
-    # the back of a triangle is seen: turning the normal over also turns the bitangent, which the sign of
-    # the handedness undoes
+    # the back of a triangle is seen: turning the normal over also turns the bitangent, which the
+    # sign of the handedness undoes
     back = cosine > 0
     hit.normal = dr.select(back, -hit.normal, hit.normal)
     if hit.handedness is not None:
@@ -108,9 +111,11 @@ def interpolate(surface: Surface, camera: Camera, samples: Samples, resolution: 
     return hit
 
 
-def interpolate_at(surface: Surface, triangle: mi.UInt32, b1: mi.Float, b2: mi.Float, area: mi.Float) -> Hit:
-    """Attributes at barycentric points of triangles, seen from outside; ``area`` of the patch that a
-    point stands for, in world units squared. ``to_viewer`` is zero."""
+def interpolate_at(
+    surface: Surface, triangle: mi.UInt32, b1: mi.Float, b2: mi.Float, area: mi.Float
+) -> Hit:
+    """Attributes at barycentric points of triangles, seen from outside; ``area`` of the patch that
+    a point stands for, in world units squared. ``to_viewer`` is zero."""
     face, rows = _triangle(surface, triangle)
     p = [mi.Point3f(r[0], r[1], r[2]) for r in rows]
     facing = dr.cross(p[1] - p[0], p[2] - p[0])
@@ -125,7 +130,9 @@ def face_normal(surface: Surface, triangle: mi.UInt32, active: mi.Bool) -> mi.Ve
     face = dr.gather(mi.ArrayXu, surface.faces, triangle, active, shape=(4, dr.width(triangle)))
     p = []
     for k in range(3):
-        row = dr.gather(mi.ArrayXf, surface.vertices, face[k], active, shape=(8, dr.width(triangle)))
+        row = dr.gather(
+            mi.ArrayXf, surface.vertices, face[k], active, shape=(8, dr.width(triangle))
+        )
         p.append(mi.Point3f(row[0], row[1], row[2]))
     return dr.cross(p[1] - p[0], p[2] - p[0])
 
@@ -146,9 +153,10 @@ def _attributes(
     facing: mi.Vector3f,
     area: mi.Float,
 ) -> None:
-    """Fill in the interpolated attributes of ``hit``: normal, and what the surface has of vertex colours,
-    texture coordinates and tangents. ``facing``: normal of the triangle by its winding, twice its area long; it is
-    taken where vertices have no normal. ``area`` of a sample on the surface becomes its UV footprint."""
+    """Fill in the interpolated attributes of ``hit``: normal, and what the surface has of vertex
+    colours, texture coordinates and tangents. ``facing``: normal of the triangle by its winding,
+    twice its area long; it is taken where vertices have no normal. ``area`` of a sample on the
+    surface becomes its UV footprint."""
     b0 = 1 - b1 - b2
 
     def mix(values: list) -> mi.Float:
@@ -176,4 +184,6 @@ def _attributes(
 
 
 def _packet(buffer: mi.Float, index: mi.UInt32, channels: int) -> mi.ArrayXf:
-    return dr.gather(mi.ArrayXf, buffer, index, mode=dr.ReduceMode.Expand, shape=(channels, dr.width(index)))
+    return dr.gather(
+        mi.ArrayXf, buffer, index, mode=dr.ReduceMode.Expand, shape=(channels, dr.width(index))
+    )

@@ -1,7 +1,7 @@
 """Mip-mapped texture lookups from one flat buffer of packed texels.
 
-All maps of a material live in one texel of ``channels`` floats (a power of two), so that a corner of
-the bilinear footprint is one packet load. Several materials, and all their mip levels, share one
+All maps of a material live in one texel of ``channels`` floats (a power of two), so that a corner
+of the bilinear footprint is one packet load. Several materials, and all their mip levels, share one
 buffer; a small table says where each level starts and how large it is.
 """
 
@@ -29,8 +29,8 @@ class PyramidLayout:
     """Where each mip level of each material starts.
 
     ``sizes[m][k]`` is the (width, height) of level k of material m in texels, ``offsets[m][k]`` its
-    first texel in the flat buffer. Every material lists the same number of levels (small ones repeat
-    their last), so that (material, level) is one index into the table.
+    first texel in the flat buffer. Every material lists the same number of levels (small ones
+    repeat their last), so that (material, level) is one index into the table.
     """
 
     channels: int
@@ -75,8 +75,9 @@ def pyramid_layout(
 
 @dataclass(frozen=True)
 class Pyramid:
-    """Texels on the device, with their layout. ``texels`` may carry gradients if they are in single precision; the rest
-    never does. ``table`` (4 per material and level): offset, width, height, wrap mode."""
+    """Texels on the device, with their layout. ``texels`` may carry gradients if they are in single
+    precision; the rest never does. ``table`` (4 per material and level): offset, width, height,
+    wrap mode."""
 
     layout: PyramidLayout
     texels: mi.Float | mi.Float16
@@ -86,7 +87,9 @@ class Pyramid:
     def of(cls, layout: PyramidLayout, texels: mi.Float) -> Pyramid:
         """A pyramid with the table of its layout."""
         table = np.zeros((len(layout.sizes), layout.levels, 4), np.uint32)
-        for m, (sizes, offsets, wrap) in enumerate(zip(layout.sizes, layout.offsets, layout.wraps, strict=True)):
+        for m, (sizes, offsets, wrap) in enumerate(
+            zip(layout.sizes, layout.offsets, layout.wraps, strict=True)
+        ):
             for k, ((w, h), offset) in enumerate(zip(sizes, offsets, strict=True)):
                 table[m, k] = offset, w, h, wrap
         return cls(layout, texels, mi.UInt32(table.ravel()))
@@ -113,7 +116,8 @@ class Pyramid:
         lower = mi.UInt32(lod)
         fraction = lod - mi.Float(lower)
         fine = self._bilinear(base + lower, uv)
-        # no reading, and no gradient to write, where the finest level is enough: half of a point sample's lookups
+        # no reading, and no gradient to write, where the finest level is enough: half of a point
+        # sample's lookups
         coarse = self._bilinear(base + lower + 1, uv, fraction > 0)
         return [dr.fma(fraction, b - a, a) for a, b in zip(fine, coarse, strict=True)]
 
@@ -125,7 +129,9 @@ class Pyramid:
         return mi.Float(row[1]), mi.Float(row[2])
 
     def _bilinear(self, entry: mi.UInt32, uv: mi.Point2f, active: mi.Bool | bool = True) -> list:
-        row = dr.gather(mi.ArrayXu, self.table, entry, shape=(4, max(dr.width(entry), dr.width(uv))))
+        row = dr.gather(
+            mi.ArrayXu, self.table, entry, shape=(4, max(dr.width(entry), dr.width(uv)))
+        )
         offset, width, height = row[0], row[1], row[2]
         x = dr.fma(uv.x, mi.Float(width), -0.5)
         y = dr.fma(uv.y, mi.Float(height), -0.5)
@@ -151,11 +157,14 @@ class Pyramid:
         if isinstance(self.texels, mi.Float16):
             return mi.ArrayXf(dr.gather(mi.ArrayXf16, self.texels, index, active, shape=shape))
         # Expand: one private copy of the gradient per thread; atomics are 2.6x slower (measured).
-        return dr.gather(mi.ArrayXf, self.texels, index, active, mode=dr.ReduceMode.Expand, shape=shape)
+        return dr.gather(
+            mi.ArrayXf, self.texels, index, active, mode=dr.ReduceMode.Expand, shape=shape
+        )
 
 
 def _wrap(i: mi.Int32, size: mi.Int32, mode: int | mi.Int32) -> mi.Int32:
-    """Texel coordinate i brought into [0, size). ``mode`` is a constant when all materials share it."""
+    """Texel coordinate i brought into [0, size). ``mode`` is a constant when all materials share
+    it."""
     if isinstance(mode, int):
         if mode == CLAMP:
             return dr.clip(i, 0, size - 1)
@@ -165,7 +174,9 @@ def _wrap(i: mi.Int32, size: mi.Int32, mode: int | mi.Int32) -> mi.Int32:
         return dr.minimum(period, 2 * size - 1 - period)
     mirrored = _wrap(i, size, MIRROR)
     repeated = _wrap(i, size, REPEAT)
-    return dr.select(mode == CLAMP, dr.clip(i, 0, size - 1), dr.select(mode == MIRROR, mirrored, repeated))
+    return dr.select(
+        mode == CLAMP, dr.clip(i, 0, size - 1), dr.select(mode == MIRROR, mirrored, repeated)
+    )
 
 
 def _modulo(i: mi.Int32, size: mi.Int32) -> mi.Int32:
@@ -197,8 +208,8 @@ BAND_BYTES = 1 << 26
 
 @dataclass(frozen=True)
 class Base:
-    """The base level of one material, made row by row: ``rows(start, stop)`` are its texels (stop - start, width,
-    channels), float32 linear."""
+    """The base level of one material, made row by row: ``rows(start, stop)`` are its texels (stop -
+    start, width, channels), float32 linear."""
 
     width: int
     height: int
@@ -208,15 +219,24 @@ class Base:
     @classmethod
     def of(cls, texels: NDArray[np.float32]) -> Base:
         """Of texels (H, W, channels) that are there."""
-        return cls(texels.shape[1], texels.shape[0], texels.shape[2], lambda start, stop: texels[start:stop])
+        return cls(
+            texels.shape[1],
+            texels.shape[0],
+            texels.shape[2],
+            lambda start, stop: texels[start:stop],
+        )
 
 
 def build_pyramid(
-    bases: Sequence[Base], wraps: Sequence[int], max_levels: int = 16, kind: type[np.floating] = np.float32
+    bases: Sequence[Base],
+    wraps: Sequence[int],
+    max_levels: int = 16,
+    kind: type[np.floating] = np.float32,
 ) -> Pyramid:
-    """Pyramid of the textures of several materials, made on the host: of what no one fits. ``kind``: float32, or
-    float16 (11 bits) for half the memory, which is what lookups wait for; base levels are never held in single
-    precision then, which for a map of 8192^2 texels would take two gigabytes."""
+    """Pyramid of the textures of several materials, made on the host: of what no one fits.
+    ``kind``: float32, or float16 (11 bits) for half the memory, which is what lookups wait for;
+    base levels are never held in single precision then, which for a map of 8192^2 texels would take
+    two gigabytes."""
     channels = bases[0].channels
     layout = pyramid_layout([(b.width, b.height) for b in bases], channels, wraps, max_levels)
     flat = np.empty((layout.texel_count, channels), kind)
@@ -254,7 +274,9 @@ def _downsample(texels: NDArray[np.float32]) -> NDArray[np.float32]:
     """The mean of 2 x 2 texels of (H, W, C); edges clamp. See ``downsample``."""
     height, width = texels.shape[:2]
     texels = np.pad(texels, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
-    return (texels[::2, ::2] + texels[::2, 1::2] + texels[1::2, ::2] + texels[1::2, 1::2]) * np.float32(0.25)
+    return (
+        texels[::2, ::2] + texels[::2, 1::2] + texels[1::2, ::2] + texels[1::2, 1::2]
+    ) * np.float32(0.25)
 
 
 def _write(flat: NDArray, offset: int, texels: NDArray[np.float32]) -> None:

@@ -17,13 +17,13 @@ if TYPE_CHECKING:
     from appearance_opt.render.passing import Scene
 
 ACROSS = (0.48, 0.65, 0.59)
-"""Single-sided faces are told apart by the sign of the component of their normals along this direction, which hardly
-any plane contains."""
+"""Single-sided faces are told apart by the sign of the component of their normals along this
+direction, which hardly any plane contains."""
 
 
 def scene_of(positions: NDArray, faces: NDArray, culled: NDArray | None = None) -> Scene:
-    """What rays through one triangle mesh are traced in: a Mitsuba scene (Embree or OptiX), or, with faces that are
-    ``culled`` (F,) when seen from behind, two of them."""
+    """What rays through one triangle mesh are traced in: a Mitsuba scene (Embree or OptiX), or,
+    with faces that are ``culled`` (F,) when seen from behind, two of them."""
     if culled is None:
         return mi.load_dict({"type": "scene", "mesh": _mesh_of(positions, faces)})
     normals = _normals(positions, faces)
@@ -50,9 +50,9 @@ def _normals(positions: NDArray, faces: NDArray) -> NDArray[np.float64]:
 class MovingScene:
     """The ``scene`` of one triangle mesh that moves. ``culled``: as in ``scene_of``.
 
-    On the CPU it is an instance of the mesh: Mitsuba asks Embree for the best BVH of a scene's own shapes, which splits
-    triangles and takes two to four times as long as the plain one that it asks for what is instanced. Rays take longer,
-    by up to two thirds.
+    On the CPU it is an instance of the mesh: Mitsuba asks Embree for the best BVH of a scene's own
+    shapes, which splits triangles and takes two to four times as long as the plain one that it asks
+    for what is instanced. Rays take longer, by up to two thirds.
     """
 
     def __init__(self, positions: NDArray, faces: NDArray, culled: NDArray | None = None) -> None:
@@ -63,7 +63,9 @@ class MovingScene:
             return
         halves = []
         for own in _halves(_normals(positions, faces), culled):
-            half = Half(_moving(positions, faces[own]), mi.UInt32(own.astype(np.uint32)), mi.Float())
+            half = Half(
+                _moving(positions, faces[own]), mi.UInt32(own.astype(np.uint32)), mi.Float()
+            )
             self._parts.append(_MovingHalf(half, faces[own], culled[own]))
             halves.append(half)
         self.scene = SidedScene(halves)

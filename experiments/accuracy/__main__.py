@@ -22,7 +22,9 @@ MODELS = (("spot/spot.obj", False), (HELMET, False), (HELMET, True))
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--images", action="store_true")
     arguments = parser.parse_args()
     models = [(asset(name), mapped) for name, mapped in MODELS] if arguments.images else []
@@ -67,7 +69,9 @@ def texture_tables() -> None:
     print("\n| lookup | texture | largest difference |\n|---|---|---|")
     for size in ((64, 64), (37, 5), (1, 1), (1, 256)):
         for wrap in textures.WRAPS:
-            print(f"| bilinear, {wrap} | {size[0]} x {size[1]} | {textures.bilinear(size, wrap):.1e} |")
+            print(
+                f"| bilinear, {wrap} | {size[0]} x {size[1]} | {textures.bilinear(size, wrap):.1e} |"
+            )
     for size in ((64, 64), (256, 64)):
         print(f"| mip levels | {size[0]} x {size[1]} | {max(textures.levels(size)):.1e} |")
     print(f"| trilinear | 64 x 64 | {textures.trilinear((64, 64)):.1e} |")

@@ -1,4 +1,5 @@
-"""A module of the renderer in double precision: its own source, with Dr.Jit's double arrays for Mitsuba's types."""
+"""A module of the renderer in double precision: its own source, with Dr.Jit's double arrays for
+Mitsuba's types."""
 
 from __future__ import annotations
 
@@ -13,12 +14,15 @@ import mitsuba as mi
 
 def double_arrays() -> Any:
     """Dr.Jit's array types of the device that Mitsuba's variant computes on."""
-    return importlib.import_module("drjit.cuda.ad" if mi.variant().startswith("cuda") else "drjit.llvm.ad")
+    return importlib.import_module(
+        "drjit.cuda.ad" if mi.variant().startswith("cuda") else "drjit.llvm.ad"
+    )
 
 
 def in_double(module: ModuleType, **replaced: object) -> ModuleType:
-    """The module's source executed once more, with double arrays where it says ``mi.Float`` and so on.
-    ``replaced``: names of the module to set afterwards, e.g. functions it imports from another."""
+    """The module's source executed once more, with double arrays where it says ``mi.Float`` and so
+    on. ``replaced``: names of the module to set afterwards, e.g. functions it imports from
+    another."""
     arrays = double_arrays()
     three, two = arrays.Array3f64, arrays.Array2f64
     types = SimpleNamespace(

@@ -1,4 +1,5 @@
-"""Our image against Mitsuba's ``direct`` integrator: same surface, BRDF, light and camera, on real models."""
+"""Our image against Mitsuba's ``direct`` integrator: same surface, BRDF, light and camera, on real
+models."""
 
 from __future__ import annotations
 
@@ -23,7 +24,8 @@ SAMPLES = 64
 
 @dataclass(frozen=True)
 class Comparison:
-    """PSNR (dB) of display values over black, and the share of pixels that differ by more than 2 / 255."""
+    """PSNR (dB) of display values over black, and the share of pixels that differ by more than 2 /
+    255."""
 
     psnr: float
     differing: float
@@ -32,10 +34,10 @@ class Comparison:
 
 
 def compare(path: Path, resolution: int = 256, normal_maps: bool = False) -> Comparison:
-    """One view of a model, lit from the eye (Mitsuba traces shadows). ``normal_maps``: with them, by Mitsuba's own
-    BSDF ``normalmap``, which builds frames from the texture coordinates of each triangle, where glTF has MikkTSpace's
-    smooth tangents. Its frames are right-handed: faces with mirrored coordinates get a map with the green turned
-    over."""
+    """One view of a model, lit from the eye (Mitsuba traces shadows). ``normal_maps``: with them,
+    by Mitsuba's own BSDF ``normalmap``, which builds frames from the texture coordinates of each
+    triangle, where glTF has MikkTSpace's smooth tangents. Its frames are right-handed: faces with
+    mirrored coordinates get a map with the green turned over."""
     asset = split(load(path), str(path), "compare").fitted  # the peer draws no transparency
     asset = Placement.around(asset.points()).local(asset)
     if not normal_maps:
@@ -59,21 +61,26 @@ def compare_asset(asset: Asset, views: Views, resolution: int) -> Comparison:
             scene[name] = mitsuba_peer.mesh(name, mesh.positions, faces, bsdf, **attributes)
     integrator = mi.load_dict({"type": "direct"})
     sensor = mitsuba_peer.sensor(views, 0, resolution)
-    theirs = np.array(mi.render(mi.load_dict(scene), sensor=sensor, integrator=integrator, spp=SAMPLES))
+    theirs = np.array(
+        mi.render(mi.load_dict(scene), sensor=sensor, integrator=integrator, spp=SAMPLES)
+    )
     a, b = (linear_to_srgb(np.clip(i, 0, 1).astype(np.float32)) for i in (ours, theirs))
     differing = float(np.mean(np.abs(a - b).max(-1) > 2 / 255))
     return Comparison(float(-10 * np.log10(np.mean((a - b) ** 2))), differing, a, b)
 
 
 def _by_handedness(mesh: Mesh) -> list[tuple[NDArray, bool]]:
-    """(faces, are their texture coordinates mirrored?): one part without a normal map, else up to two."""
+    """(faces, are their texture coordinates mirrored?): one part without a normal map, else up to
+    two."""
     if mesh.material.normal_texture is None or mesh.uvs is None:
         return [(mesh.faces, False)]
     uv = mesh.uvs[mesh.faces].astype(np.float64)
     a, b = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
     # v grows downward: a plain mapping turns the other way round
     mirrored = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0] > 0
-    return [(mesh.faces[mirrored == side], side) for side in (False, True) if (mirrored == side).any()]
+    return [
+        (mesh.faces[mirrored == side], side) for side in (False, True) if (mirrored == side).any()
+    ]
 
 
 def _mapped(mesh: Mesh, mirrored: bool) -> dict:
@@ -87,7 +94,9 @@ def _mapped(mesh: Mesh, mirrored: bool) -> dict:
 
 
 def _plain(asset: Asset) -> Asset:
-    meshes = tuple(replace(m, material=replace(m.material, normal_texture=None)) for m in asset.meshes)
+    meshes = tuple(
+        replace(m, material=replace(m.material, normal_texture=None)) for m in asset.meshes
+    )
     return replace(asset, meshes=meshes)
 
 

@@ -22,8 +22,9 @@ COUNT = 200_000
 
 @dataclass(frozen=True)
 class Line:
-    """Errors of one function: of each value (vectors: by their length) relative to the exact one, or to 1e-4 of the
-    largest where it is smaller than that, as a difference that cancels has no digits to keep."""
+    """Errors of one function: of each value (vectors: by their length) relative to the exact one,
+    or to 1e-4 of the largest where it is smaller than that, as a difference that cancels has no
+    digits to keep."""
 
     function: str
     domain: str
@@ -51,7 +52,9 @@ class Precision:
         self.three = arrays.Array3f64 if double else mi.Vector3f
         self.color = arrays.Array3f64 if double else mi.Color3f
         twin = in_double if double else (lambda m, **_: m)
-        self.brdf, self.losses, self.mesh_ops, self.coverage = map(twin, (brdf, losses, mesh_ops, coverage))
+        self.brdf, self.losses, self.mesh_ops, self.coverage = map(
+            twin, (brdf, losses, mesh_ops, coverage)
+        )
         self.rays = twin(rays)
         self.surface = twin(surface, direction=self.rays.direction)
         self.silhouette = twin(silhouette)
@@ -66,13 +69,16 @@ class Precision:
 
 
 def directions(rng: np.random.Generator, count: int) -> NDArray[np.float32]:
-    """Unit vectors of the upper hemisphere, a third of them within a degree of the horizon, some at the pole."""
+    """Unit vectors of the upper hemisphere, a third of them within a degree of the horizon, some at
+    the pole."""
     z = rng.random(count)
     z[: count // 3] = rng.random(count // 3) * 0.0175
     z[-100:] = 1.0
     angle = rng.uniform(0, 2 * np.pi, count)
     r = np.sqrt(1 - z**2)
-    return rng.permutation(np.stack([r * np.cos(angle), r * np.sin(angle), z], 1)).astype(np.float32)
+    return rng.permutation(np.stack([r * np.cos(angle), r * np.sin(angle), z], 1)).astype(
+        np.float32
+    )
 
 
 def lines() -> list[Line]:
@@ -89,23 +95,36 @@ def reflection(one: Precision, two: Precision) -> list[Line]:
         v, light = directions(rng, COUNT), directions(rng, COUNT)
         mirror = slice(0, COUNT // 5)  # exactly in mirror direction: the peak
         light[mirror] = v[mirror] * np.array([-1, -1, 1], np.float32)
-        base, rest = rng.random((COUNT, 3)).astype(np.float32), rng.random((COUNT, 3)).astype(np.float32)
+        base, rest = (
+            rng.random((COUNT, 3)).astype(np.float32),
+            rng.random((COUNT, 3)).astype(np.float32),
+        )
         roughness = (low + (high - low) * rest[:, 0]).astype(np.float32)
-        metalness = np.where(rest[:, 1] < 0.2, 0, np.where(rest[:, 1] > 0.8, 1, rest[:, 1])).astype(np.float32)
+        metalness = np.where(rest[:, 1] < 0.2, 0, np.where(rest[:, 1] > 0.8, 1, rest[:, 1])).astype(
+            np.float32
+        )
         results = []
         for p in (one, two):
             color = p.color(*(p.scalar(base[:, k]) for k in range(3)))
             m = p.brdf.MaterialSample(color, p.scalar(roughness), p.scalar(metalness))
             n = p.vector(np.tile(np.array([0, 0, 1], np.float32), (COUNT, 1)))
             results.append(p.brdf.reflect(m, n, p.vector(v), p.vector(light)))
-        out.append(line("brdf.reflect", f"roughness {low} to {high}, all directions, mirror and grazing", *results))
+        out.append(
+            line(
+                "brdf.reflect",
+                f"roughness {low} to {high}, all directions, mirror and grazing",
+                *results,
+            )
+        )
     return out
 
 
 def tone(one: Precision, two: Precision) -> list[Line]:
     """Tone map and losses from 0 to 1e6."""
     rng = np.random.default_rng(2)
-    x = np.concatenate([[0.0, 0.0031308, 0.00313571, 1e6], 10 ** rng.uniform(-8, 6, COUNT)]).astype(np.float32)
+    x = np.concatenate([[0.0, 0.0031308, 0.00313571, 1e6], 10 ** rng.uniform(-8, 6, COUNT)]).astype(
+        np.float32
+    )
     y = (x * (1 + 0.3 * rng.normal(size=len(x)).astype(np.float32))).clip(0).astype(np.float32)
     out = []
     pairs = [("losses.srgb", "srgb", False), ("losses.tone_map", "tone_map", False)]
@@ -133,16 +152,24 @@ def geometry(one: Precision, two: Precision) -> list[Line]:
     ):
         positions = (rough * np.array(scale)).astype(np.float32).ravel()
         corner = [mi.UInt32(np.ascontiguousarray(mesh.faces[:, k], np.uint32)) for k in range(3)]
-        frame = [mi.UInt32(np.ascontiguousarray(mesh.frame_faces[:, k], np.uint32)) for k in range(3)]
+        frame = [
+            mi.UInt32(np.ascontiguousarray(mesh.frame_faces[:, k], np.uint32)) for k in range(3)
+        ]
         normals, tangents = [], []
         for p in (one, two):
             c = p.mesh_ops.Corners(
-                tuple(corner), tuple(frame), mi.UInt32(mesh.frame_vertex.astype(np.uint32)), p.scalar(mesh.uvs.ravel())
+                tuple(corner),
+                tuple(frame),
+                mi.UInt32(mesh.frame_vertex.astype(np.uint32)),
+                p.scalar(mesh.uvs.ravel()),
             )
             n = p.mesh_ops.vertex_normals(p.scalar(positions), c)
             normals.append(n)
             tangents.append(p.mesh_ops.vertex_tangents(p.scalar(positions), n, c))
-        out += [line("mesh_ops.vertex_normals", domain, *normals), line("mesh_ops.vertex_tangents", domain, *tangents)]
+        out += [
+            line("mesh_ops.vertex_normals", domain, *normals),
+            line("mesh_ops.vertex_tangents", domain, *tangents),
+        ]
     return out
 
 
@@ -173,7 +200,8 @@ def screen(one: Precision, two: Precision) -> list[Line]:
 
 
 def hits(one: Precision, two: Precision, cosine: float) -> Line:
-    """Barycentric coordinates of rays at triangles seen at one angle: the position is rebuilt from them."""
+    """Barycentric coordinates of rays at triangles seen at one angle: the position is rebuilt from
+    them."""
     rng = np.random.default_rng(6)
     count = COUNT // 4
     p0 = rng.normal(size=(count, 3)) * 0.3
@@ -185,7 +213,11 @@ def hits(one: Precision, two: Precision, cosine: float) -> Line:
     lean = other * cosine + view * np.sqrt(1 - cosine**2)
     triangle = np.stack([p0, p0 + 0.05 * side, p0 + 0.05 * lean], 1).astype(np.float32)
     b1, b2 = rng.random((2, count)) * 0.5
-    target = triangle[:, 0] * (1 - b1 - b2)[:, None] + triangle[:, 1] * b1[:, None] + triangle[:, 2] * b2[:, None]
+    target = (
+        triangle[:, 0] * (1 - b1 - b2)[:, None]
+        + triangle[:, 1] * b1[:, None]
+        + triangle[:, 2] * b2[:, None]
+    )
     scale = 1 / np.tan(np.radians(16))
     d = target - np.array([0.0, 0.0, 3.5])
     x, y = ((1 + a / -d[:, 2] * scale) * 256 for a in (d[:, 0], -d[:, 1]))
@@ -198,12 +230,18 @@ def hits(one: Precision, two: Precision, cosine: float) -> Line:
     for p in (one, two):
         ones = np.ones((count, 1), np.float32)
         half = np.float32(np.tan(np.radians(16)))
-        axes = [np.array(a, np.float32) for a in ((0, 0, 3.5), (0, 0, -1), (half, 0, 0), (0, -half, 0))]
+        axes = [
+            np.array(a, np.float32) for a in ((0, 0, 3.5), (0, 0, -1), (half, 0, 0), (0, -half, 0))
+        ]
         eye, forward, right, down = (p.vector(ones * a) for a in axes)
         camera = SimpleNamespace(eye=eye, forward=forward, right=right, down=down)
         s = SimpleNamespace(
-            x=p.scalar(x.astype(np.float32)), y=p.scalar(y.astype(np.float32)), triangle=dr.arange(mi.UInt32, count)
+            x=p.scalar(x.astype(np.float32)),
+            y=p.scalar(y.astype(np.float32)),
+            triangle=dr.arange(mi.UInt32, count),
         )
         shape = p.surface.Surface(mi.UInt32(faces.ravel()), p.scalar(vertices.ravel()))
         results.append(p.surface.interpolate(shape, camera, s, p.float(512), p.float(1.0)).position)
-    return line("surface.interpolate, position", f"triangles seen at a cosine of {cosine}", *results)
+    return line(
+        "surface.interpolate, position", f"triangles seen at a cosine of {cosine}", *results
+    )

@@ -21,19 +21,23 @@ def image(size: tuple[int, int], seed: int = 0) -> NDArray[np.float32]:
 
 
 def bilinear(size: tuple[int, int], wrap: str) -> float:
-    """Largest difference of bilinear lookups at random places, a third of them outside of the unit square."""
+    """Largest difference of bilinear lookups at random places, a third of them outside of the unit
+    square."""
     import OpenImageIO as oiio
 
     pixels = image(size)
     uv = np.random.default_rng(1).uniform(-1, 2, (LOOKUPS, 2)).astype(np.float32)
-    ours = _lookup(build_pyramid([Base.of(pixels)], [WRAPS[wrap]]), uv, np.zeros(LOOKUPS, np.float32))
+    ours = _lookup(
+        build_pyramid([Base.of(pixels)], [WRAPS[wrap]]), uv, np.zeros(LOOKUPS, np.float32)
+    )
     buffer = oiio.ImageBuf(pixels)
     theirs = np.array([buffer.interppixel_NDC(float(u), float(v), wrap) for u, v in uv])
     return float(np.abs(ours - theirs).max())
 
 
 def levels(size: tuple[int, int]) -> list[float]:
-    """Largest difference of each mip level from those that OpenImageIO's texture maker writes with a box filter."""
+    """Largest difference of each mip level from those that OpenImageIO's texture maker writes with
+    a box filter."""
     import OpenImageIO as oiio
 
     pixels = image(size)
@@ -47,8 +51,8 @@ def levels(size: tuple[int, int]) -> list[float]:
 
 
 def trilinear(size: tuple[int, int]) -> float:
-    """Largest difference of trilinear lookups over footprints from a quarter texel to the whole texture: theirs is
-    the blend of bilinear lookups in the two nearest of their own levels."""
+    """Largest difference of trilinear lookups over footprints from a quarter texel to the whole
+    texture: theirs is the blend of bilinear lookups in the two nearest of their own levels."""
     import OpenImageIO as oiio
 
     pixels = image(size)
@@ -62,7 +66,9 @@ def trilinear(size: tuple[int, int]) -> float:
     theirs = np.zeros((LOOKUPS, 4))
     for i, ((u, v), at) in enumerate(zip(uv, np.maximum(lod, 0), strict=True)):
         k = int(at)
-        fine, coarse = (np.array(b.interppixel_NDC(float(u), float(v), "clamp")) for b in buffers[k : k + 2])
+        fine, coarse = (
+            np.array(b.interppixel_NDC(float(u), float(v), "clamp")) for b in buffers[k : k + 2]
+        )
         theirs[i] = fine + (at - k) * (coarse - fine)
     return float(np.abs(ours - theirs).max())
 

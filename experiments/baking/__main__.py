@@ -7,12 +7,12 @@ BPY is a virtual environment of its own, for Blender's package wants other versi
 
     python3.11 -m venv BPY && BPY/bin/pip install "bpy==4.5.*"
 
-Without --blender, its table stays empty. Pairs: each asset decimated to 2 to 5 % of its triangles and unwrapped,
-geometry alone; both bakers get the same two files. The judge is the renderer in ``../shared/judge``, which is not
-ours. --joint adds a bake whose shape is fitted, too, without any triangle more (``bake --joint --subdivision 0``),
-from the same two files. Each stage that is on disk in ``out/baking`` is not run again (delete the folder to start
-over); ``--table`` prints the tables for docs/baking.md from what is there. Times are of the bakes alone, ours with warm
-kernels.
+Without --blender, its table stays empty. Pairs: each asset decimated to 2 to 5 % of its triangles
+and unwrapped, geometry alone; both bakers get the same two files. The judge is the renderer in
+``../shared/judge``, which is not ours. --joint adds a bake whose shape is fitted, too, without any
+triangle more (``bake --joint --subdivision 0``), from the same two files. Each stage that is on
+disk in ``out/baking`` is not run again (delete the folder to start over); ``--table`` prints the
+tables for docs/baking.md from what is there. Times are of the bakes alone, ours with warm kernels.
 """
 
 from __future__ import annotations
@@ -38,10 +38,14 @@ def ours(source: Path, low: Path, stem: Path, preset: str, steps: int | None) ->
     """Closed form and fit. Returns times and what was found."""
     from appearance_opt import bake, bake_options
 
-    closed = bake(source, low, f"{stem}_closed.glb", bake_options(closed_form=True, texture_size=SIZE))
+    closed = bake(
+        source, low, f"{stem}_closed.glb", bake_options(closed_form=True, texture_size=SIZE)
+    )
     again = bake(source, low, None, bake_options(closed_form=True, texture_size=SIZE))
     begin = time.perf_counter()
-    fitted = bake(source, low, f"{stem}_fitted.glb", bake_options(preset, texture_size=SIZE, steps=steps))
+    fitted = bake(
+        source, low, f"{stem}_fitted.glb", bake_options(preset, texture_size=SIZE, steps=steps)
+    )
     assert fitted.fit is not None
     return {
         "missed": closed.missed_share,
@@ -66,29 +70,46 @@ def with_shape(source: Path, low: Path, stem: Path, preset: str, steps: int | No
 
 
 def blender(python: str, source: Path, low: Path, stem: Path, reach: float) -> dict:
-    """Blender's bake at the best of several cages: its cage takes the first surface from outside, so one that
-    is wide enough for the whole mesh shows neighbouring parts. Best: nearest to ours in the mean."""
+    """Blender's bake at the best of several cages: its cage takes the first surface from outside,
+    so one that is wide enough for the whole mesh shows neighbouring parts. Best: nearest to ours in
+    the mean."""
     script = Path(__file__).with_name("blender_bake.py")
     tried = {}
     for share in CAGES:
         folder = Path(f"{stem}_blender_{share:g}")
         if not (folder / "seconds.json").exists():
-            command = [python, str(script), str(source), str(low), str(folder), str(SIZE), str(share * reach), "4"]
+            command = [
+                python,
+                str(script),
+                str(source),
+                str(low),
+                str(folder),
+                str(SIZE),
+                str(share * reach),
+                "4",
+            ]
             subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
         seconds = json.loads((folder / "seconds.json").read_text())
         apart = angles(Path(f"{stem}_closed.glb"), np.load(folder / "normal.npy"))
-        tried[share] = {"cage": share * reach, "seconds": sum(seconds.values()), "seconds_by_map": seconds, **apart}
+        tried[share] = {
+            "cage": share * reach,
+            "seconds": sum(seconds.values()),
+            "seconds_by_map": seconds,
+            **apart,
+        }
     best = min(tried, key=lambda share: tried[share]["all_mean"])
     blender_asset(stem, Path(f"{stem}_blender_{best:g}"))
     return {**tried[best], "tried": tried, "same_rule": same_rule(source, low, stem, best, reach)}
 
 
 def same_rule(source: Path, low: Path, stem: Path, share: float, reach: float) -> dict:
-    """Blender's normals against ours when our rays are Blender's: to the outermost surface of the same cage, from the
-    middle of each texel."""
+    """Blender's normals against ours when our rays are Blender's: to the outermost surface of the
+    same cage, from the middle of each texel."""
     from appearance_opt import bake, bake_options
 
-    options = bake_options(closed_form=True, texture_size=SIZE, hit="outermost", cage=share * reach, samples=1)
+    options = bake_options(
+        closed_form=True, texture_size=SIZE, hit="outermost", cage=share * reach, samples=1
+    )
     bake(source, low, f"{stem}_outermost.glb", options)
     return angles(Path(f"{stem}_outermost.glb"), np.load(f"{stem}_blender_{share:g}/normal.npy"))
 
@@ -103,9 +124,9 @@ def blender_asset(stem: Path, folder: Path) -> None:
 
 
 def angles(baked: Path, theirs: np.ndarray) -> dict:
-    """Degrees between the normal map of a file and one of Blender, over covered texels ("all"), and over those whose
-    normal in Blender's map points out of LOW ("outward"). The others show the back of a triangle of HIGH, where
-    Blender's ray, unlike ours, stops: no light reaches them."""
+    """Degrees between the normal map of a file and one of Blender, over covered texels ("all"), and
+    over those whose normal in Blender's map points out of LOW ("outward"). The others show the back
+    of a triangle of HIGH, where Blender's ray, unlike ours, stops: no light reaches them."""
     from appearance_opt import load
     from appearance_opt.baking.target_mesh import prepare
     from appearance_opt.baking.texel_points import texel_coverage
@@ -124,7 +145,9 @@ def angles(baked: Path, theirs: np.ndarray) -> dict:
     return out
 
 
-def run_row(asset: str, preset: str, steps: int | None, python: str | None, views: int, free: bool) -> dict:
+def run_row(
+    asset: str, preset: str, steps: int | None, python: str | None, views: int, free: bool
+) -> dict:
     """One asset, all stages."""
     from appearance_opt import backend
 
@@ -132,7 +155,11 @@ def run_row(asset: str, preset: str, steps: int | None, python: str | None, view
     OUT.mkdir(parents=True, exist_ok=True)
     stem = OUT / asset
     path = Path(f"{stem}.json")
-    row = json.loads(path.read_text()) if path.exists() else {"asset": asset, "triangles": ROWS[asset]}
+    row = (
+        json.loads(path.read_text())
+        if path.exists()
+        else {"asset": asset, "triangles": ROWS[asset]}
+    )
     source, low = source_of(asset), Path(f"{stem}_low.glb")
     if not low.exists():
         make_low(source, ROWS[asset], low)
@@ -150,7 +177,9 @@ def run_row(asset: str, preset: str, steps: int | None, python: str | None, view
         path.write_text(json.dumps(row, indent=1))
     if "scores" not in row or row.get("views") != views:
         names = ["closed", "fitted", *(n for n in ("blender", "joint") if n in row)]
-        row.update(scores=judge(source, {n: f"{stem}_{n}.glb" for n in names}, stem, views), views=views)
+        row.update(
+            scores=judge(source, {n: f"{stem}_{n}.glb" for n in names}, stem, views), views=views
+        )
         path.write_text(json.dumps(row, indent=1))
     return row
 
@@ -191,7 +220,11 @@ def tables(rows: list[dict]) -> str:
         cells = [cell(f) for f in fits] + ["not run"] * (2 - len(fits))
         gains = ", ".join(f"{f['psnr_cov'] - c['psnr_cov']:+.2f}" for f in fits)
         flips = ", ".join(f"{f['flip'] / c['flip']:.2f}" for f in fits)
-        steps = ", ".join(str(n) for n in (r["ours"]["fit_steps"], r.get("joint", {}).get("steps")) if n is not None)
+        steps = ", ".join(
+            str(n)
+            for n in (r["ours"]["fit_steps"], r.get("joint", {}).get("steps"))
+            if n is not None
+        )
         lines.append(
             f"| {r['asset']}, {r['triangles']} | {cell(c)} | {' | '.join(cells)} | {gains} | {flips} | {steps} |"
         )
@@ -211,7 +244,17 @@ def main() -> None:
     names = [n for n in a.rows.split(",") if n]
     if a.table:
         found = [OUT / f"{n}.json" for n in names]
-        print(tables([r for p in found if p.exists() for r in [json.loads(p.read_text())] if "scores" in r]))
+        print(
+            tables(
+                [
+                    r
+                    for p in found
+                    if p.exists()
+                    for r in [json.loads(p.read_text())]
+                    if "scores" in r
+                ]
+            )
+        )
         return
     needs_judge()
     print(tables([run_row(n, a.preset, a.steps, a.blender, a.views, a.joint) for n in names]))

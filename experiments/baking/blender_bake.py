@@ -1,11 +1,12 @@
-"""Blender's "selected to active" bake of one pair of meshes. Runs in Blender's own Python, not in ours:
+"""Blender's "selected to active" bake of one pair of meshes. Runs in Blender's own Python, not in
+ours:
 
     BPY/bin/python experiments/baking/blender_bake.py HIGH.glb LOW.glb OUT_FOLDER SIZE EXTRUSION SAMPLES
 
-where BPY is a virtual environment with the package ``bpy`` (see experiments/baking/__main__.py). Writes normal.npy,
-base_color.npy, roughness.npy and metalness.npy ((SIZE, SIZE, 3) uint16, row 0 on top, linear but the colour, which is
-sRGB) and seconds.json into OUT_FOLDER.
-LOW keeps the normals and texture coordinates of its file.
+where BPY is a virtual environment with the package ``bpy`` (see experiments/baking/__main__.py).
+Writes normal.npy, base_color.npy, roughness.npy and metalness.npy ((SIZE, SIZE, 3) uint16, row 0 on
+top, linear but the colour, which is sRGB) and seconds.json into OUT_FOLDER. LOW keeps the normals
+and texture coordinates of its file.
 """
 
 from __future__ import annotations
@@ -35,8 +36,8 @@ def load(path: str) -> bpy.types.Object:
 
 
 def emit(materials: list[bpy.types.Material], socket: str) -> None:
-    """Send an input of every principled shader to the output as emission: what has no pass of its own is baked
-    so."""
+    """Send an input of every principled shader to the output as emission: what has no pass of its
+    own is baked so."""
     for material in materials:
         tree = material.node_tree
         shader = next((n for n in tree.nodes if n.type == "BSDF_PRINCIPLED"), None)
@@ -47,7 +48,9 @@ def emit(materials: list[bpy.types.Material], socket: str) -> None:
             tree.links.new(source.links[0].from_socket, emission.inputs["Color"])
         else:
             value = source.default_value
-            emission.inputs["Color"].default_value = tuple(value) if socket == "Base Color" else (value,) * 3 + (1,)
+            emission.inputs["Color"].default_value = (
+                tuple(value) if socket == "Base Color" else (value,) * 3 + (1,)
+            )
         tree.links.new(emission.outputs[0], output.inputs["Surface"])
 
 
@@ -75,11 +78,17 @@ def write(image: bpy.types.Image, path: Path, srgb: bool) -> None:
     image.pixels.foreach_get(pixels)
     pixels = pixels.reshape(size, size, 4)[::-1, :, :3]
     if srgb:
-        pixels = np.where(pixels <= 0.0031308, pixels * 12.92, 1.055 * np.maximum(pixels, 1e-9) ** (1 / 2.4) - 0.055)
+        pixels = np.where(
+            pixels <= 0.0031308,
+            pixels * 12.92,
+            1.055 * np.maximum(pixels, 1e-9) ** (1 / 2.4) - 0.055,
+        )
     np.save(path, (np.clip(pixels, 0, 1) * 65535 + 0.5).astype(np.uint16))
 
 
-def main(high_path: str, low_path: str, out: str, size: int, extrusion: float, samples: int) -> None:
+def main(
+    high_path: str, low_path: str, out: str, size: int, extrusion: float, samples: int
+) -> None:
     bpy.ops.wm.read_factory_settings(use_empty=True)
     scene = bpy.context.scene
     scene.render.engine = "CYCLES"

@@ -2,8 +2,8 @@
 
     python -m experiments.baking.limits [--rows chess_king,flight_helmet,relic] [--steps 200] [--views 12]
 
-Three figures for the closed-form bake of each pair of ``experiments.baking``, all of the same views of 256 x 256,
-by the renderer of the fit:
+Three figures for the closed-form bake of each pair of ``experiments.baking``, all of the same views
+of 256 x 256, by the renderer of the fit:
 
 - how much of the squared error lies in pixels that an outline of either mesh crosses: no map reaches those;
 - the PSNR if every other pixel were perfect: what no map, and no colour that changes with the view, can exceed;
@@ -32,8 +32,8 @@ RESOLUTION, SIZE = 256, 1024
 
 
 def outline_share(reference: NDArray, candidate: NDArray) -> tuple[float, float, float]:
-    """(PSNR over covered pixels, share of the squared error in pixels that are not fully covered in both images,
-    PSNR if the others were perfect), means over views."""
+    """(PSNR over covered pixels, share of the squared error in pixels that are not fully covered in
+    both images, PSNR if the others were perfect), means over views."""
     from appearance_opt.render.display import display
 
     rows = []
@@ -42,7 +42,13 @@ def outline_share(reference: NDArray, candidate: NDArray) -> tuple[float, float,
         either = (r[..., 3] > 0) | (c[..., 3] > 0)
         outline = either & ((r[..., 3] < 1 - 1e-4) | (c[..., 3] < 1 - 1e-4))
         total, left = error[either].sum(), error[outline].sum()
-        rows.append([-10 * np.log10(total / either.sum()), left / total, -10 * np.log10(left / either.sum())])
+        rows.append(
+            [
+                -10 * np.log10(total / either.sum()),
+                left / total,
+                -10 * np.log10(left / either.sum()),
+            ]
+        )
     psnr, share, bound = np.mean(rows, axis=0)
     return float(psnr), float(share), float(bound)
 
@@ -75,7 +81,13 @@ def limits(asset: str, steps: int, views: int) -> dict:
     psnr, share, bound = outline_share(images, exact.render(model))
     # the pool draws the same groups of four from the same stream: it holds these views and no other
     pool = ReferencePool(
-        job.reference, sampler, 4 * (views // 4), 4, RESOLUTION, POOL_SAMPLES, point_width(RESOLUTION, SIZE)
+        job.reference,
+        sampler,
+        4 * (views // 4),
+        4,
+        RESOLUTION,
+        POOL_SAMPLES,
+        point_width(RESOLUTION, SIZE),
     )
     fit(model, pool, exact, FitOptions(steps=steps, laplacian=0.0))
     known, _, _ = outline_share(images, exact.render(model))
@@ -105,7 +117,9 @@ def main() -> None:
     kept = Kept(FOLDER / "limits.json")
     for asset in a.rows.split(","):
         key = {"asset": asset, "steps": a.steps, "views": a.views}
-        print(table([kept.row(key, lambda asset=asset: limits(asset, a.steps, a.views))]), flush=True)
+        print(
+            table([kept.row(key, lambda asset=asset: limits(asset, a.steps, a.views))]), flush=True
+        )
     print(table(kept.rows))
 
 

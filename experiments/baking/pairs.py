@@ -40,9 +40,18 @@ def maps_of_blender(mesh: Mesh, folder: Path) -> Mesh:
     """A mesh with the maps that blender_bake.py has written to ``folder``."""
     from appearance_opt.asset.types import Material, Texture
 
-    maps = {n: np.load(folder / f"{n}.npy") for n in ("normal", "base_color", "roughness", "metalness")}
+    maps = {
+        n: np.load(folder / f"{n}.npy") for n in ("normal", "base_color", "roughness", "metalness")
+    }
     byte = {n: np.round(m / 257).astype(np.uint8) for n, m in maps.items()}
-    orm = np.stack([np.full((SIZE, SIZE), 255, np.uint8), byte["roughness"][..., 0], byte["metalness"][..., 0]], -1)
+    orm = np.stack(
+        [
+            np.full((SIZE, SIZE), 255, np.uint8),
+            byte["roughness"][..., 0],
+            byte["metalness"][..., 0],
+        ],
+        -1,
+    )
     clamp = ("clamp", "clamp")
     material = Material(
         roughness=1.0,

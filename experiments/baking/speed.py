@@ -2,8 +2,9 @@
 
     python -m experiments.baking.speed [--asset chess_king] [--sizes 1024,2048,4096] [--samples 4] [--maps ...]
 
-The command ``bake --closed-form`` from file to file, on the pair that ``experiments.baking`` makes: reading, checks,
-rays, filling and writing included. CPU time is that of all threads together; memory is the largest resident set.
+The command ``bake --closed-form`` from file to file, on the pair that ``experiments.baking`` makes:
+reading, checks, rays, filling and writing included. CPU time is that of all threads together;
+memory is the largest resident set.
 """
 
 from __future__ import annotations
@@ -41,7 +42,10 @@ def main() -> None:
         out = Path(OUT / f"{a.asset}_{size}.glb")
         r = isolated(BAKE, str(source), str(low), str(out), size, a.samples, a.maps)
         stages = ", ".join(f"{n} {s:.1f}" for n, s in r["stages"].items() if n != "total")
-        print(f"| {size} x {size} | {r['wall']:.0f} | {r['cpu']:.0f} | {r['peak_gib']:.2f} | {stages} |", flush=True)
+        print(
+            f"| {size} x {size} | {r['wall']:.0f} | {r['cpu']:.0f} | {r['peak_gib']:.2f} | {stages} |",
+            flush=True,
+        )
 
 
 if __name__ == "__main__":

@@ -2,8 +2,8 @@
 
     python -m experiments.bench [--quick] [--device cuda]
 
-Prints Markdown tables for docs/performance.md and writes out/bench.json. Medians and ranges over steps after warm-up;
-compare ratios within one run, not times between machines.
+Prints Markdown tables for docs/performance.md and writes out/bench.json. Medians and ranges over
+steps after warm-up; compare ratios within one run, not times between machines.
 """
 
 from __future__ import annotations
@@ -52,13 +52,19 @@ def main() -> None:
 
 
 def cases(quick: bool) -> dict[str, dict]:
-    """Sizes to time: resolution of 4 views, triangles of latent and reference, map size, and where the reference's
-    images come from: they are "kept", rendered "live" in every step with one ray per pixel, or rendered as a fit does
-    it (in every ``--reuse``-th step, finely at outlines). The object fills the views; with "room" they are that much
-    wider and higher, so that it covers as much of them as a long or branched one does."""
+    """Sizes to time: resolution of 4 views, triangles of latent and reference, map size, and where
+    the reference's images come from: they are "kept", rendered "live" in every step with one ray
+    per pixel, or rendered as a fit does it (in every ``--reuse``-th step, finely at outlines). The
+    object fills the views; with "room" they are that much wider and higher, so that it covers as
+    much of them as a long or branched one does."""
     base = {"resolution": 256, "latent": 3000, "reference": 100_000, "maps": 512, "images": "kept"}
     live, in_fit = {**base, "images": "live"}, {**base, "images": "as in a fit"}
-    out = {"256": base, "256, live reference": live, "256, as in a fit": in_fit, "128": {**base, "resolution": 128}}
+    out = {
+        "256": base,
+        "256, live reference": live,
+        "256, as in a fit": in_fit,
+        "128": {**base, "resolution": 128},
+    }
     out["512, 1024 maps"] = {**base, "resolution": 512, "maps": 1024}
     for how, case in (("live reference", live), ("as in a fit", in_fit)):
         out[f"256, {how}, a third covered"] = {**case, "room": 1.5}
@@ -75,14 +81,31 @@ def cases(quick: bool) -> dict[str, dict]:
 
 def in_process(case: dict, device: str) -> dict:
     """Each case in a process of its own: its peak memory is its own."""
-    command = [sys.executable, "-m", "experiments.bench", "--device", device, "--case", json.dumps(case)]
-    return json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout.splitlines()[-1])
+    command = [
+        sys.executable,
+        "-m",
+        "experiments.bench",
+        "--device",
+        device,
+        "--case",
+        json.dumps(case),
+    ]
+    return json.loads(
+        subprocess.run(command, check=True, capture_output=True, text=True).stdout.splitlines()[-1]
+    )
 
 
 def run_case(
-    resolution: int, latent: int, reference: int, maps: int, images: str, room: float = 1.0, steps: int = 24
+    resolution: int,
+    latent: int,
+    reference: int,
+    maps: int,
+    images: str,
+    room: float = 1.0,
+    steps: int = 24,
 ) -> dict:
-    """Median and range in ms of a whole step, the sum of its kernels, kernels compiled, peak memory."""
+    """Median and range in ms of a whole step, the sum of its kernels, kernels compiled, peak
+    memory."""
     from appearance_opt.config import CommonOptions
     from appearance_opt.fit import adam
     from appearance_opt.fit.laplacian import Laplacian
@@ -101,10 +124,14 @@ def run_case(
     laplacian = Laplacian(mesh.positions, mesh.faces, model.edge_length, relative=True)
     moments = {n: adam.moments_of(p) for n, p in model.parameters.items()}
     width = point_width(resolution, maps)
-    gradients = Gradients(model, grid, Quality(point_width=width), LOSSES["log-srgb-l1"], {0: laplacian})
+    gradients = Gradients(
+        model, grid, Quality(point_width=width), LOSSES["log-srgb-l1"], {0: laplacian}
+    )
     views = [sampler.draw(k, 4) for k in range(8)]
     kept = [Targets(source.render_device(v.records(), grid, 1)) for v in views]
-    pool = ReferencePool(source, sampler, 8, 4, resolution, POOL_SAMPLES, width, CommonOptions.reuse)
+    pool = ReferencePool(
+        source, sampler, 8, 4, resolution, POOL_SAMPLES, width, CommonOptions.reuse
+    )
     at_once = CommonOptions.reuse if images == "as in a fit" else 1
 
     def one(k: int) -> None:
@@ -127,8 +154,9 @@ def run_case(
 
 
 def timings(one: Callable[[int], None], steps: int, at_once: int) -> dict:
-    """Wall-clock time of ``steps`` calls after warm-up, then kernel times and compilations of eight more. Times are per
-    call and in ms; ``at_once``: calls that are timed together, for they differ."""
+    """Wall-clock time of ``steps`` calls after warm-up, then kernel times and compilations of eight
+    more. Times are per call and in ms; ``at_once``: calls that are timed together, for they
+    differ."""
     import drjit as dr
 
     for k in range(10):
@@ -179,12 +207,16 @@ def growth(rows: dict) -> str:
     out = []
     if "1024" in t:
         exponent = np.polyfit(
-            np.log([128**2, 256**2, 512**2, 1024**2]), np.log([t[k] for k in ("128", "256", "512", "1024")]), 1
+            np.log([128**2, 256**2, 512**2, 1024**2]),
+            np.log([t[k] for k in ("128", "256", "512", "1024")]),
+            1,
         )[0]
         out.append(f"exponent of time in pixels, 128^2 to 1024^2: {exponent:.2f}")
         out.append(f"50k latent over 3k: {t['50k latent'] / t['256']:.2f}")
         for how in ("live", "as in a fit"):
-            out.append(f"1M reference over 10k, {how}: {t[f'1M reference, {how}'] / t[f'10k reference, {how}']:.2f}")
+            out.append(
+                f"1M reference over 10k, {how}: {t[f'1M reference, {how}'] / t[f'10k reference, {how}']:.2f}"
+            )
     return "\n" + "\n".join(out)
 
 

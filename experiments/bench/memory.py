@@ -2,8 +2,9 @@
 
     python -m experiments.bench.memory [--triangles 5000000] [--texels 8192] [--budget 19s]
 
-Makes a bumpy sphere with four maps (base colour, ORM, normal, emission), simplifies it to 3,000 triangles in a process
-of its own, and prints the peak of that process and how long it took. Needs nothing, but 2 GiB of disk.
+Makes a bumpy sphere with four maps (base colour, ORM, normal, emission), simplifies it to 3,000
+triangles in a process of its own, and prints the peak of that process and how long it took. Needs
+nothing, but 2 GiB of disk.
 """
 
 from __future__ import annotations
@@ -63,12 +64,22 @@ def main() -> None:
     source = folder / f"{options.triangles}_{options.texels}.glb"
     write_asset(source, options.triangles, options.texels)
     effort = ["--budget", options.budget] if options.budget else ["--steps", "3"]
-    command = [sys.executable, "-m", "appearance_opt", "simplify", str(source), "--triangles", str(TRIANGLES)]
+    command = [
+        sys.executable,
+        "-m",
+        "appearance_opt",
+        "simplify",
+        str(source),
+        "--triangles",
+        str(TRIANGLES),
+    ]
     began = time.perf_counter()
     subprocess.run([*command, *effort, "--out", str(folder / "light.glb")], check=True)
     seconds = time.perf_counter() - began
     peak = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 2**20
-    print(f"{options.triangles:,} triangles, four maps of {options.texels}^2: peak {peak:.1f} GiB, {seconds:.0f} s")
+    print(
+        f"{options.triangles:,} triangles, four maps of {options.texels}^2: peak {peak:.1f} GiB, {seconds:.0f} s"
+    )
 
 
 if __name__ == "__main__":

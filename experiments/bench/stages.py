@@ -44,7 +44,8 @@ class Stopwatch:
         self.milliseconds: dict[str, float] = {}
 
     def timed(self, name: str, work: Callable[[], object]) -> object:
-        """Time ``work`` several times, the device idle before and after; returns its last result."""
+        """Time ``work`` several times, the device idle before and after; returns its last
+        result."""
         times = []
         for _ in range(REPEATS):
             dr.sync_thread()
@@ -67,7 +68,9 @@ def stages(resolution: int, maps: int) -> dict[str, float]:
     stopwatch = Stopwatch()
     timed = stopwatch.timed
 
-    timed("reference image, rendered live, 1 sample", lambda: source.render_device(records, grid, 1))
+    timed(
+        "reference image, rendered live, 1 sample", lambda: source.render_device(records, grid, 1)
+    )
 
     def rebuild() -> None:
         # a new array: Mitsuba skips parameters that are the same as before
@@ -85,7 +88,9 @@ def stages(resolution: int, maps: int) -> dict[str, float]:
     run = Frozen(model.fixed(), grid)
 
     def forward(quality: Quality) -> gradient.RenderedBatch:
-        return gradient.render(scene, surface, all_maps, edges, records, grid, quality, 0, True, run)
+        return gradient.render(
+            scene, surface, all_maps, edges, records, grid, quality, 0, True, run
+        )
 
     timed("visibility alone", lambda: forward(Quality(0.0, 1, 1)).image)
     timed("visibility, silhouettes, averaged pixels", lambda: forward(quality).image)
@@ -101,11 +106,15 @@ def stages(resolution: int, maps: int) -> dict[str, float]:
     def backward() -> tuple:
         return run(pulled_back, batch, model.shape(), layer, by_image)
 
-    def pulled_back(batch: gradient.RenderedBatch, shape: Shape, layer: TexelLayer, by_image: mi.Float) -> tuple:
+    def pulled_back(
+        batch: gradient.RenderedBatch, shape: Shape, layer: TexelLayer, by_image: mi.Float
+    ) -> tuple:
         shape, layer = model.track(shape, layer)
         fresh, moving = model.maps(layer), model.surface(shape.positions)
         terms = gradient.surrogate(batch, moving, fresh, edges, by_image)
-        direct = gradient.direct(batch, moving, fresh, lambda c, pixel: covered_loss(loss, target, c, pixel))
+        direct = gradient.direct(
+            batch, moving, fresh, lambda c, pixel: covered_loss(loss, target, c, pixel)
+        )
         gradient.backward([*terms, direct])
         return dr.grad(shape.positions), dr.grad(layer.pyramid.texels)
 
@@ -115,7 +124,10 @@ def stages(resolution: int, maps: int) -> dict[str, float]:
     down = model.codec.pull_back(grads[1], parameter.value)
     moments = {n: adam.moments_of(p) for n, p in model.parameters.items()}
     timed("Adam, texels", lambda: adam.update(parameter, down, moments[TEXELS], 1.0)[0])
-    timed("Adam, positions", lambda: adam.update(model.parameters[POSITIONS], grads[0], moments[POSITIONS], 1.0)[0])
+    timed(
+        "Adam, positions",
+        lambda: adam.update(model.parameters[POSITIONS], grads[0], moments[POSITIONS], 1.0)[0],
+    )
     return stopwatch.milliseconds
 
 

@@ -1,8 +1,10 @@
-"""Primary visibility: rays through a BVH against triangles drawn onto pixels, by size of mesh and image.
+"""Primary visibility: rays through a BVH against triangles drawn onto pixels, by size of mesh and
+image.
 
     python -m experiments.bench.visibility
 
-Both in turns in one process; the rays' BVH is there already. "differ": pixels in which they see another triangle.
+Both in turns in one process; the rays' BVH is there already. "differ": pixels in which they see
+another triangle.
 """
 
 from __future__ import annotations
@@ -27,7 +29,9 @@ TRIANGLES, RESOLUTIONS = (3_000, 30_000, 100_000, 300_000, 1_000_000), (256, 512
 
 def main() -> None:
     backend.select("cpu")
-    print("| triangles | pixels | rays (ms) | drawn (ms) | ratio | differ |\n|---|---|---|---|---|---|")
+    print(
+        "| triangles | pixels | rays (ms) | drawn (ms) | ratio | differ |\n|---|---|---|---|---|---|"
+    )
     for triangles in TRIANGLES:
         mesh = bumpy_sphere(triangles).meshes[0]
         scene = upload.scene_of(mesh.positions, mesh.faces)
@@ -35,10 +39,15 @@ def main() -> None:
         for resolution in RESOLUTIONS:
             traced, drawn, differ = compared(scene, vertices, faces, Grid(VIEWS, resolution))
             times = f"{traced:.1f} | {drawn:.1f} | {drawn / traced:.2f}"
-            print(f"| {len(mesh.faces)} | {VIEWS} x {resolution}² | {times} | {differ:.0e} |", flush=True)
+            print(
+                f"| {len(mesh.faces)} | {VIEWS} x {resolution}² | {times} | {differ:.0e} |",
+                flush=True,
+            )
 
 
-def compared(scene: mi.Scene, vertices: mi.Float, faces: mi.UInt32, grid: Grid) -> tuple[float, float, float]:
+def compared(
+    scene: mi.Scene, vertices: mi.Float, faces: mi.UInt32, grid: Grid
+) -> tuple[float, float, float]:
     """(median ms by rays, median ms drawn, part of the pixels in which they differ)."""
     run, half = Frozen(vertices, faces), dr.opaque(mi.Float, 0.5)
     views = [ViewSampler((0.0, 0.0, 0.0), 1.0).draw(k, VIEWS).records() for k in range(REPEATS)]
@@ -50,7 +59,9 @@ def compared(scene: mi.Scene, vertices: mi.Float, faces: mi.UInt32, grid: Grid) 
         return run(rays.trace_depth, scene, views[k], grid.view, x, y, grid.size)[0].triangle
 
     def by_drawing(k: int) -> mi.UInt32:
-        return run(raster.visible, vertices, faces, views[k], *at, grid.views, grid.pixels)[0].triangle
+        return run(raster.visible, vertices, faces, views[k], *at, grid.views, grid.pixels)[
+            0
+        ].triangle
 
     both: list[tuple[Callable[[int], mi.UInt32], list[float]]] = [(by_rays, []), (by_drawing, [])]
     differ = []

@@ -4,10 +4,11 @@
     python -m experiments.cleanup --table
 
 Each asset is simplified without a fit, damaged (``damage.py``), and mended in two ways: "init" is
-``simplify --init BAD.glb --absolute``, "joint" is ``bake --joint --subdivision 2``, which keeps BAD's texture
-coordinates and adds a displacement map. "Won back": the share of the difference between the damaged mesh and the
-undamaged start that is undone. Results are kept row by row in ``out/cleanup/results.json``, and a picture of each row
-(reference, start, damaged, cleaned, in two views) beside it. Needs ``../shared/judge/references``.
+``simplify --init BAD.glb --absolute``, "joint" is ``bake --joint --subdivision 2``, which keeps
+BAD's texture coordinates and adds a displacement map. "Won back": the share of the difference
+between the damaged mesh and the undamaged start that is undone. Results are kept row by row in
+``out/cleanup/results.json``, and a picture of each row (reference, start, damaged, cleaned, in two
+views) beside it. Needs ``../shared/judge/references``.
 """
 
 from __future__ import annotations
@@ -30,14 +31,22 @@ WAYS = ("init", "joint")
 VIEWS, LEVEL = 8, 2
 
 
-def measured(source: Path, asset: Asset, box: tuple[np.ndarray, np.ndarray]) -> tuple[dict, np.ndarray]:
-    """Look and shape of a candidate (its volume as a share of a box), and its image beside the reference's."""
+def measured(
+    source: Path, asset: Asset, box: tuple[np.ndarray, np.ndarray]
+) -> tuple[dict, np.ndarray]:
+    """Look and shape of a candidate (its volume as a share of a box), and its image beside the
+    reference's."""
     from appearance_opt.render.display import display
 
     compared = ao.compare(source, asset, views=VIEWS)
     names = ("psnr_covered", "flip", "silhouette_shift", "silhouette_iou")
     look = {n: getattr(compared.metrics, n) for n in names}
-    images = np.stack([display(i[:2]).reshape(-1, *i.shape[2:3], 3) for i in (compared.reference, compared.candidate)])
+    images = np.stack(
+        [
+            display(i[:2]).reshape(-1, *i.shape[2:3], 3)
+            for i in (compared.reference, compared.candidate)
+        ]
+    )
     return {**look, "volume": volume(asset, box), "pieces": pieces(asset)}, images
 
 
@@ -66,10 +75,16 @@ def row(asset: str, kinds: tuple[str, ...], way: str, common: dict) -> dict:
         n: measured(source, v, good.bounds())
         for n, v in (("start", good), ("damaged", spoilt), ("cleaned", result.shown))
     }
-    strip = np.concatenate([states["start"][1][0], *(images[1] for _, images in states.values())], axis=1)
+    strip = np.concatenate(
+        [states["start"][1][0], *(images[1] for _, images in states.values())], axis=1
+    )
     picture = encode_png((np.clip(strip, 0, 1) * 255 + 0.5).astype(np.uint8))
     bad.with_name(f"{bad.stem}_{way}.png").write_bytes(picture)
-    facts = {"seconds": result.seconds["total"], "steps": result.fit.steps, "drawn": result.shown.triangle_count}
+    facts = {
+        "seconds": result.seconds["total"],
+        "steps": result.fit.steps,
+        "drawn": result.shown.triangle_count,
+    }
     return {**facts, **{n: look for n, (look, _) in states.items()}}
 
 
@@ -101,7 +116,11 @@ def table(rows: list[dict]) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--assets", default=",".join(TRIANGLES))
-    parser.add_argument("--kinds", default=";".join(DAMAGES) + ";" + ",".join(DAMAGES), help="sets, ';' between them")
+    parser.add_argument(
+        "--kinds",
+        default=";".join(DAMAGES) + ";" + ",".join(DAMAGES),
+        help="sets, ';' between them",
+    )
     parser.add_argument("--ways", default=",".join(WAYS))
     parser.add_argument("--budget", type=float, default=60.0)
     parser.add_argument("--steps", type=int)
@@ -110,10 +129,17 @@ def main() -> None:
     OUT.mkdir(parents=True, exist_ok=True)
     kept = Kept(OUT / "results.json")
     common = {"budget": a.budget} if a.steps is None else {"steps": a.steps}
-    cases = [(n, k.split(","), w) for n in a.assets.split(",") for k in a.kinds.split(";") for w in a.ways.split(",")]
+    cases = [
+        (n, k.split(","), w)
+        for n in a.assets.split(",")
+        for k in a.kinds.split(";")
+        for w in a.ways.split(",")
+    ]
     for asset, kinds, way in cases if not a.table else ():
         key = {"asset": asset, "kinds": kinds, "way": way, "common": common}
-        found = kept.row(key, lambda asset=asset, kinds=kinds, way=way: row(asset, tuple(kinds), way, common))
+        found = kept.row(
+            key, lambda asset=asset, kinds=kinds, way=way: row(asset, tuple(kinds), way, common)
+        )
         print(table([found]).splitlines()[2], flush=True)
     print(table(kept.rows))
 

@@ -1,4 +1,5 @@
-"""Meshes as other tools spoil them: procedural damage to a simplified mesh, each kind by itself or all together."""
+"""Meshes as other tools spoil them: procedural damage to a simplified mesh, each kind by itself or
+all together."""
 
 from __future__ import annotations
 
@@ -16,9 +17,9 @@ DAMAGES = ("volume", "detached", "texture", "intersections")
 
 
 def damaged(asset: Asset, kinds: tuple[str, ...] = DAMAGES, seed: int = 0) -> Asset:
-    """The asset (one mesh) with some of ``DAMAGES``. "volume": smoothed until it has shrunk. "detached": three
-    patches moved off by a few percent of the size. "texture": base colour shifted and scrambled in blocks.
-    "intersections": patches pushed through the surface."""
+    """The asset (one mesh) with some of ``DAMAGES``. "volume": smoothed until it has shrunk.
+    "detached": three patches moved off by a few percent of the size. "texture": base colour shifted
+    and scrambled in blocks. "intersections": patches pushed through the surface."""
     rng = np.random.default_rng(seed)
     mesh = asset.meshes[0]
     first, place = weld(mesh.positions)
@@ -34,7 +35,9 @@ def damaged(asset: Asset, kinds: tuple[str, ...] = DAMAGES, seed: int = 0) -> As
     if "detached" in kinds:
         p, place, mesh = _detached(p, place, mesh, rng, size)
     positions = p[place].astype(np.float32)
-    mesh = replace(mesh, positions=positions, normals=vertex_normals(positions, mesh.faces), tangents=None)
+    mesh = replace(
+        mesh, positions=positions, normals=vertex_normals(positions, mesh.faces), tangents=None
+    )
     if "texture" in kinds:
         mesh = _retextured(mesh, rng)
     return replace(asset, meshes=(mesh,), name=f"{asset.name}_damaged")
@@ -44,11 +47,14 @@ VOLUME_POINTS = 2000
 
 
 def volume(asset: Asset, box: tuple[NDArray, NDArray]) -> float:
-    """Share of a box that the surface encloses: random points, the same for all, whose winding number (solid angle over
-    4 pi, van Oosterom and Strackee 1983) is above 1/2 in magnitude. What two overlapping parts enclose counts
-    once, and small gaps matter little, unlike for the divergence theorem."""
+    """Share of a box that the surface encloses: random points, the same for all, whose winding
+    number (solid angle over 4 pi, van Oosterom and Strackee 1983) is above 1/2 in magnitude. What
+    two overlapping parts enclose counts once, and small gaps matter little, unlike for the
+    divergence theorem."""
     low, high = box
-    points = (low + (high - low) * np.random.default_rng(0).random((VOLUME_POINTS, 3))).astype(np.float32)
+    points = (low + (high - low) * np.random.default_rng(0).random((VOLUME_POINTS, 3))).astype(
+        np.float32
+    )
     corners = np.concatenate([m.positions[m.faces] for m in asset.meshes]).astype(np.float32)
     inside = 0
     for part in np.array_split(points, 50):
@@ -63,7 +69,9 @@ def volume(asset: Asset, box: tuple[NDArray, NDArray]) -> float:
 
 def _smoothed(p: NDArray, faces: NDArray, rounds: int) -> NDArray:
     """Uniform Laplacian smoothing, which shrinks."""
-    i, j = np.concatenate([faces[:, [a, b]] for a, b in ((0, 1), (1, 2), (2, 0), (1, 0), (2, 1), (0, 2))]).T
+    i, j = np.concatenate(
+        [faces[:, [a, b]] for a, b in ((0, 1), (1, 2), (2, 0), (1, 0), (2, 1), (0, 2))]
+    ).T
     adjacency = coo_matrix((np.ones(len(i)), (i, j)), shape=(len(p), len(p))).tocsr()
     adjacency.data[:] = 1
     degree = np.maximum(np.asarray(adjacency.sum(axis=1)), 1)
@@ -79,8 +87,9 @@ def _patch(p: NDArray, rng: np.random.Generator, radius: float) -> NDArray[np.bo
 def _detached(
     p: NDArray, place: NDArray, mesh: Mesh, rng: np.random.Generator, size: float
 ) -> tuple[NDArray, NDArray, Mesh]:
-    """Patches of faces cut out and moved off. ``place``: the point of ``p`` of each vertex of the file; vertices on a
-    cut are doubled. Returns both and the mesh with the new vertices, whose positions are still to be set."""
+    """Patches of faces cut out and moved off. ``place``: the point of ``p`` of each vertex of the
+    file; vertices on a cut are doubled. Returns both and the mesh with the new vertices, whose
+    positions are still to be set."""
     centres = p[place[mesh.faces]].mean(axis=1)
     for _ in range(3):
         near = np.linalg.norm(centres - centres[rng.integers(len(centres))], axis=1) < 0.12 * size
@@ -100,19 +109,26 @@ def _detached(
 def _retextured(mesh: Mesh, rng: np.random.Generator) -> Mesh:
     texture = mesh.material.base_color_texture
     assert texture is not None
-    pixels = np.roll(texture.pixels, (texture.pixels.shape[0] // 16, texture.pixels.shape[1] // 16), (0, 1)).copy()
+    pixels = np.roll(
+        texture.pixels, (texture.pixels.shape[0] // 16, texture.pixels.shape[1] // 16), (0, 1)
+    ).copy()
     block = max(pixels.shape[0] // 8, 1)
     for _ in range(12):
         (y, x), (v, u) = rng.integers(0, pixels.shape[0] - block, (2, 2))
         pixels[y : y + block, x : x + block] = pixels[v : v + block, u : u + block].copy()
-    return replace(mesh, material=replace(mesh.material, base_color_texture=Texture(pixels, "srgb", texture.wrap)))
+    return replace(
+        mesh,
+        material=replace(mesh.material, base_color_texture=Texture(pixels, "srgb", texture.wrap)),
+    )
 
 
 def pieces(asset: Asset) -> int:
     """Connected pieces of the welded mesh."""
     p = np.concatenate([m.positions for m in asset.meshes])
     start = np.cumsum([0] + [len(m.positions) for m in asset.meshes[:-1]])
-    faces = weld(p)[1][np.concatenate([m.faces + s for m, s in zip(asset.meshes, start, strict=True)])]
+    faces = weld(p)[1][
+        np.concatenate([m.faces + s for m, s in zip(asset.meshes, start, strict=True)])
+    ]
     i, j = faces[:, [0, 1, 2]].ravel(), faces[:, [1, 2, 0]].ravel()
     n = int(faces.max()) + 1
     labels = connected_components(coo_matrix((np.ones(len(i)), (i, j)), shape=(n, n)), False)[1]

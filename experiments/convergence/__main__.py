@@ -4,10 +4,10 @@
     python -m experiments.convergence --rows sphere decimated:pairs --seconds 5 --out out/try
     python -m experiments.convergence --plot                # picture and tables from what was measured
 
-Each fit is one row of out/convergence/curves.csv per look at the held-out views; a rerun skips fits of the same length
-that are there, and picture and tables are of the fits of ``--seconds``. Needs spot and flight_helmet in
-``../shared/assets``.
-Images of the reference are rendered, and kernels compiled, before the clock starts.
+Each fit is one row of out/convergence/curves.csv per look at the held-out views; a rerun skips fits
+of the same length that are there, and picture and tables are of the fits of ``--seconds``. Needs
+spot and flight_helmet in ``../shared/assets``. Images of the reference are rendered, and kernels
+compiled, before the clock starts.
 """
 
 from __future__ import annotations
@@ -42,7 +42,9 @@ WARM_UP = 4
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--rows", nargs="*", default=names(), help="case, or case:estimator")
     parser.add_argument("--seconds", type=float, default=25.0, help="of each fit")
     parser.add_argument("--seeds", type=int, default=1)
@@ -56,8 +58,15 @@ def main() -> None:
         backend.select("cpu")
         for seed in range(arguments.seeds):
             for name in names():
-                wanted = [e for e in ESTIMATORS if name in arguments.rows or f"{name}:{e}" in arguments.rows]
-                there = {(r["case"], r["estimator"], int(r["seed"])) for r in lasting(rows_of(path), arguments.seconds)}
+                wanted = [
+                    e
+                    for e in ESTIMATORS
+                    if name in arguments.rows or f"{name}:{e}" in arguments.rows
+                ]
+                there = {
+                    (r["case"], r["estimator"], int(r["seed"]))
+                    for r in lasting(rows_of(path), arguments.seconds)
+                }
                 missing = [e for e in wanted if (name, e, seed) not in there]
                 if missing:
                     run(make_case(name, seed), missing, seed, arguments.seconds, path)
@@ -73,7 +82,10 @@ def run(case: Case, estimators: list[str], seed: int, seconds: float, path: Path
         rows = [(case.name, name, seed, seconds, p.seconds, p.step, p.psnr) for p in result.curve]
         keep(path, rows)
         last = result.curve[-1]
-        print(f"{case.name:10} {name:18} seed {seed}: {last.step:5} steps, {last.psnr:.2f} dB", flush=True)
+        print(
+            f"{case.name:10} {name:18} seed {seed}: {last.step:5} steps, {last.psnr:.2f} dB",
+            flush=True,
+        )
         gc.collect()
 
 
@@ -91,7 +103,8 @@ def lasting(rows: list[dict[str, str]], seconds: float) -> list[dict[str, str]]:
 
 
 def keep(path: Path, rows: list[tuple]) -> None:
-    """Append a curve to the table (rewritten under another name, so that it is never half there)."""
+    """Append a curve to the table (rewritten under another name, so that it is never half
+    there)."""
     path.parent.mkdir(parents=True, exist_ok=True)
     every = [tuple(r[f] for f in FIELDS) for r in rows_of(path)]
     every += [tuple(f"{v:.4f}" if isinstance(v, float) else v for v in r) for r in rows]

@@ -1,4 +1,5 @@
-"""What is fitted: a reference, a start that is wrong in its own way, and how a fit would treat it."""
+"""What is fitted: a reference, a start that is wrong in its own way, and how a fit would treat
+it."""
 
 from __future__ import annotations
 
@@ -33,7 +34,8 @@ LOOKED_AT = 128
 
 @dataclass(frozen=True)
 class Case:
-    """``make`` returns a fresh model at its start; ``pool`` holds all its images already; ``options`` lack the time."""
+    """``make`` returns a fresh model at its start; ``pool`` holds all its images already;
+    ``options`` lack the time."""
 
     name: str
     make: Callable[[], Model]
@@ -52,7 +54,8 @@ def source(name: str) -> Path:
 
 
 def make_case(name: str, seed: int) -> Case:
-    """The case of that name, its reference rendered. ``seed``: of views, backgrounds and random maps."""
+    """The case of that name, its reference rendered. ``seed``: of views, backgrounds and random
+    maps."""
     placed = Placed(load(source(name)), seed)
     make = {"sphere": _from_sphere, "decimated": _decimated, "sub-pixel": _sub_pixel}[name]
     case = make(placed.reference, placed.sampler, seed)
@@ -66,7 +69,8 @@ def _validation(reference: MeshReference, sampler: ViewSampler) -> Validation:
 
 
 def _from_sphere(reference: MeshReference, sampler: ViewSampler, seed: int) -> Case:
-    """A sphere of 4,212 triangles becomes spot, with the preconditioned steps of ``jobs.growth``."""
+    """A sphere of 4,212 triangles becomes spot, with the preconditioned steps of
+    ``jobs.growth``."""
     mesh = growth.first_shape(1404, sampler, growth.TEXTURE)
     maps = random_maps(growth.TEXTURE, seed, True)
 
@@ -76,7 +80,13 @@ def _from_sphere(reference: MeshReference, sampler: ViewSampler, seed: int) -> C
         return model
 
     pool = ReferencePool(
-        reference, sampler, growth.POOL, growth.VIEWS, growth.RESOLUTION, growth.POOL_SAMPLES, growth.POINT_WIDTH
+        reference,
+        sampler,
+        growth.POOL,
+        growth.VIEWS,
+        growth.RESOLUTION,
+        growth.POOL_SAMPLES,
+        growth.POINT_WIDTH,
     )
     options = FitOptions(laplacian=0.0, decay=1.0, seed=seed)
     return Case("sphere", make, pool, _validation(reference, sampler), options)
@@ -88,8 +98,8 @@ def _decimated(reference: MeshReference, sampler: ViewSampler, seed: int) -> Cas
 
 
 def _sub_pixel(reference: MeshReference, sampler: ViewSampler, seed: int) -> Case:
-    """flight_helmet with 9,000 triangles on 64^2 pixels: smaller than a pixel each. Bent by waves of 2 % of the
-    object's radius, for a good start has no shape to find."""
+    """flight_helmet with 9,000 triangles on 64^2 pixels: smaller than a pixel each. Bent by waves
+    of 2 % of the object's radius, for a good start has no shape to find."""
     return _from_mesh("sub-pixel", reference, sampler, seed, 9000, 64, 16, 0.02)
 
 
@@ -107,7 +117,9 @@ def _from_mesh(
     start = make_start(reference, options, sampler, triangles)
     if bend is not None:
         start = _bent(start, bend)
-    pool = ReferencePool(reference, sampler, 320, views, resolution, POOL_SAMPLES, point_width(resolution, TEXTURE))
+    pool = ReferencePool(
+        reference, sampler, 320, views, resolution, POOL_SAMPLES, point_width(resolution, TEXTURE)
+    )
     validation = _validation(reference, sampler)
 
     def fresh(rates: Rates) -> Model:
@@ -122,5 +134,9 @@ def _from_mesh(
 def _bent(start: Start, amount: float) -> Start:
     """The same start under a smooth deformation: a plane wave along each axis."""
     p = start.mesh.positions.astype(np.float64)
-    waves: NDArray = np.sin(p @ np.array([[4.1, 1.9, 0.6], [1.1, 3.7, 2.2], [2.5, 0.8, 4.4]]).T + [0.3, 1.7, 2.9])
-    return replace(start, mesh=replace(start.mesh, positions=(p + amount * waves).astype(np.float32)))
+    waves: NDArray = np.sin(
+        p @ np.array([[4.1, 1.9, 0.6], [1.1, 3.7, 2.2], [2.5, 0.8, 4.4]]).T + [0.3, 1.7, 2.9]
+    )
+    return replace(
+        start, mesh=replace(start.mesh, positions=(p + amount * waves).astype(np.float32))
+    )

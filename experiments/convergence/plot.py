@@ -21,8 +21,8 @@ COLOURS = {
 
 
 def draw(path: Path, rows: list[dict[str, str]]) -> None:
-    """Rows of ``path``, all of one length -> a table beside it; picture and CSV into docs/images if it lies where they
-    come from. Ends the program with one line if there are none."""
+    """Rows of ``path``, all of one length -> a table beside it; picture and CSV into docs/images if
+    it lies where they come from. Ends the program with one line if there are none."""
     if not rows:
         sys.exit(f"no fit of that length in {path}: run the experiment first")
     path.with_suffix(".md").write_text(table(rows))
@@ -44,7 +44,9 @@ def table(rows: list[dict[str, str]]) -> str:
     for case, estimator in dict.fromkeys((r["case"], r["estimator"]) for r in rows):
         curves = _curves(rows, case, estimator)
         budget = float(next(r["budget"] for r in rows if r["case"] == case))
-        at = [np.mean([np.interp(f * budget, t, p) for t, p, _ in curves]) for f in (0.25, 0.5, 1.0)]
+        at = [
+            np.mean([np.interp(f * budget, t, p) for t, p, _ in curves]) for f in (0.25, 0.5, 1.0)
+        ]
         steps = np.mean([s[-1] for _, _, s in curves])
         lines.append(
             f"| {case}, {budget:.0f} s | {estimator} | {steps:.0f} | {at[0]:.2f} dB | {at[1]:.2f} dB | "
@@ -64,7 +66,15 @@ def picture(rows: list[dict[str, str]], path: Path) -> None:
         for estimator in dict.fromkeys(r["estimator"] for r in rows if r["case"] == case):
             for k, (t, p, _) in enumerate(_curves(rows, case, estimator)):
                 label = estimator if k == 0 else None
-                axis.plot(t, p, color=COLOURS[estimator], label=label, linewidth=1.2, marker=".", markersize=4)
+                axis.plot(
+                    t,
+                    p,
+                    color=COLOURS[estimator],
+                    label=label,
+                    linewidth=1.2,
+                    marker=".",
+                    markersize=4,
+                )
         axis.set_title(case, fontsize=9)
         axis.set_xlabel("seconds", fontsize=8)
         axis.tick_params(labelsize=7)
@@ -83,5 +93,7 @@ def _curves(rows: list[dict[str, str]], case: str, estimator: str) -> list[tuple
     out = []
     for seed in sorted({r["seed"] for r in own}):
         curve = [r for r in own if r["seed"] == seed]
-        out.append(tuple(np.array([float(r[k]) for r in curve]) for k in ("seconds", "psnr", "step")))
+        out.append(
+            tuple(np.array([float(r[k]) for r in curve]) for k in ("seconds", "psnr", "step"))
+        )
     return out

@@ -3,10 +3,11 @@
     python -m experiments.displacement [--assets chess_king,flight_helmet,relic] [--budget 60] [--triangles 1000]
     python -m experiments.displacement --table
 
-Per asset, at level 3: the base mesh with a normal map; displacement alone; both; and a mesh of 16 times the base
-triangles with a normal map, simplified directly. All are judged as they are drawn, on held-out views.
-Results are appended to ``out/displacement/results.json`` row by row; a row that is there with the same settings is
-not run again. Needs ``../shared/judge/references`` for the first two assets.
+Per asset, at level 3: the base mesh with a normal map; displacement alone; both; and a mesh of 16
+times the base triangles with a normal map, simplified directly. All are judged as they are drawn,
+on held-out views. Results are appended to ``out/displacement/results.json`` row by row; a row that
+is there with the same settings is not run again. Needs ``../shared/judge/references`` for the first
+two assets.
 """
 
 from __future__ import annotations
@@ -78,7 +79,9 @@ def main() -> None:
     for asset in a.assets.split(",") if not a.table else ():
         for kind in a.kinds.split(","):
             key = {"asset": asset, "kind": kind, "base": a.triangles, "common": common}
-            row = kept.row(key, lambda asset=asset, kind=kind: labour(asset, kind, a.triangles, common))
+            row = kept.row(
+                key, lambda asset=asset, kind=kind: labour(asset, kind, a.triangles, common)
+            )
             print(table([row]).splitlines()[2], flush=True)
     print(table(kept.rows))
 

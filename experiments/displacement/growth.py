@@ -2,9 +2,9 @@
 
     python -m experiments.displacement.growth [CASE ...]
 
-A CASE is base triangles and level, as 1000:3. A sphere with all maps fitted (512^2), 4 views of 256 x 256, no
-reference: what the latent costs by itself. One step is forward, loss, backward with the Laplacian, and the BVH. CPU
-time is that of all threads together.
+A CASE is base triangles and level, as 1000:3. A sphere with all maps fitted (512^2), 4 views of 256
+x 256, no reference: what the latent costs by itself. One step is forward, loss, backward with the
+Laplacian, and the BVH. CPU time is that of all threads together.
 """
 
 from __future__ import annotations
@@ -40,7 +40,13 @@ def measure(triangles: int, level: int) -> str:
     from appearance_opt.views import ViewSampler
 
     flat = np.zeros((SIZE, SIZE), np.float32)
-    maps = {"red": flat + 0.5, "green": flat + 0.5, "blue": flat + 0.5, "roughness": flat + 0.5, "metalness": flat}
+    maps = {
+        "red": flat + 0.5,
+        "green": flat + 0.5,
+        "blue": flat + 0.5,
+        "roughness": flat + 0.5,
+        "metalness": flat,
+    }
     maps |= {"normal_x": flat, "normal_y": flat, "normal_z": flat + 1, "displacement": flat}
     parts = frozenset({"shape", "material", "normal", "displacement"})
     model = Model(sphere(triangles, (0.0, 0.0, 0.0), 1.0, SIZE), maps, parts, Rates(), (level,))
@@ -56,21 +62,31 @@ def measure(triangles: int, level: int) -> str:
         model.update_scene()
         dr.sync_thread()
         times.append(time.process_time() - began)
-    drawn, peak = len(model.topology.mesh.faces), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+    drawn, peak = (
+        len(model.topology.mesh.faces),
+        resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20,
+    )
     return f"| {triangles} | {level} | {drawn:,} | {1000 * float(np.median(times[2:])):.0f} | {peak:.2f} |"
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("cases", nargs="*", default=list(CASES), metavar="CASE")
     parser.add_argument("--here", action="store_true", help="measure the only case in this process")
     a = parser.parse_args()
     if a.here:
         print(measure(*(int(n) for n in a.cases[0].split(":"))))
         return
-    print("| base triangles | level | drawn | CPU ms per step | peak GiB |\n|---|---|---|---|---|", flush=True)
+    print(
+        "| base triangles | level | drawn | CPU ms per step | peak GiB |\n|---|---|---|---|---|",
+        flush=True,
+    )
     for case in a.cases:
-        subprocess.run([sys.executable, "-m", "experiments.displacement.growth", "--here", case], check=True)
+        subprocess.run(
+            [sys.executable, "-m", "experiments.displacement.growth", "--here", case], check=True
+        )
 
 
 if __name__ == "__main__":

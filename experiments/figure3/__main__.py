@@ -3,13 +3,14 @@
     python -m experiments.figure3 [--assets relic,relic_body,chess_king] [--starts sphere,decimate] [--budget 65]
     python -m experiments.figure3 --table
 
-Each asset is stripped of its material (grey 0.5, roughness 1, no metalness, no normal map): what is left is its
-geometry. "sphere": 3,000 triangles, grown from a sphere; nothing of the reference but its images is used.
-"decimate": 9,000 triangles, decimated, with the closed-form normal map. Then the closed-form baker's figure on the
-meshes that the fit found, with the same texture coordinates, and for "decimate" also on the decimated mesh itself.
-"relic_body" is the embedded urn without its handles: a sphere has none to offer.
-Views: 16 of 384 x 384 from random sides under random point lights, which no fit saw. Results are kept row by row in
-``out/figure3/results.json``. Needs ``../shared/judge/references`` for chess_king.
+Each asset is stripped of its material (grey 0.5, roughness 1, no metalness, no normal map): what is
+left is its geometry. "sphere": 3,000 triangles, grown from a sphere; nothing of the reference but
+its images is used. "decimate": 9,000 triangles, decimated, with the closed-form normal map. Then
+the closed-form baker's figure on the meshes that the fit found, with the same texture coordinates,
+and for "decimate" also on the decimated mesh itself. "relic_body" is the embedded urn without its
+handles: a sphere has none to offer. Views: 16 of 384 x 384 from random sides under random point
+lights, which no fit saw. Results are kept row by row in ``out/figure3/results.json``. Needs
+``../shared/judge/references`` for chess_king.
 """
 
 from __future__ import annotations
@@ -69,16 +70,17 @@ def row(asset: str, start: str, preset: str, common: dict) -> dict:
     values = {"preset": preset, "init": start, "triangles": TRIANGLES[start], "common": common}
     source, without = WITHOUT.get(asset, (asset, []))
     values |= {"views": VIEWS, "resolution": RESOLUTION, "without": without}
-    return isolated(FIT, str(source_of(source)), str(FOLDER / f"{asset}_{start}"), json.dumps(values))
+    return isolated(
+        FIT, str(source_of(source)), str(FOLDER / f"{asset}_{start}"), json.dumps(values)
+    )
 
 
 def cell(scores: dict | None) -> str:
     """PSNR over covered pixels and over whole images, FLIP, silhouette shift."""
     if scores is None:
         return "refused"
-    return (
-        f"{scores['psnr_covered']:.2f} / {scores['psnr']:.2f} / {scores['flip']:.4f} / {scores['silhouette_shift']:.3f}"
-    )
+    decibels = f"{scores['psnr_covered']:.2f} / {scores['psnr']:.2f}"
+    return f"{decibels} / {scores['flip']:.4f} / {scores['silhouette_shift']:.3f}"
 
 
 def table(rows: list[dict]) -> str:
@@ -112,7 +114,15 @@ def main() -> None:
         for start in a.starts.split(","):
             key = {"asset": asset, "init": start, "preset": a.preset, "common": common}
             print(
-                table([kept.row(key, lambda asset=asset, start=start: row(asset, start, a.preset, common))]), flush=True
+                table(
+                    [
+                        kept.row(
+                            key,
+                            lambda asset=asset, start=start: row(asset, start, a.preset, common),
+                        )
+                    ]
+                ),
+                flush=True,
             )
     print(table(kept.rows))
 

@@ -6,8 +6,9 @@
     python -m experiments.gradient_error --sizes spot-1k:64 --no-peers
     python -m experiments.gradient_error --plot              # table and pictures from what was measured
 
-References are computed when first asked for and kept under out/gradient_error/cache. Scenes that are in the table
-already are skipped; ``--force`` measures them, and ``--new-references`` makes the references, anew.
+References are computed when first asked for and kept under out/gradient_error/cache. Scenes that
+are in the table already are skipped; ``--force`` measures them, and ``--new-references`` makes the
+references, anew.
 """
 
 from __future__ import annotations
@@ -51,11 +52,18 @@ SETTINGS = {
     "edges 8, 16 rays, 2 x 2, intersections": Quality(8.0, 16, 4, intersections=True),
     "edges 16, 64 rays, 4 x 4": Quality(16.0, 64, 16),
 }
-"""Edges: silhouette points per pixel of silhouette, rays per pixel that a silhouette crosses, rays in the others (one
-where nothing is said)."""
+"""Edges: silhouette points per pixel of silhouette, rays per pixel that a silhouette crosses, rays
+in the others (one where nothing is said)."""
 
 PEERS = [("direct_projective", s) for s in (4, 16, 64)] + [("prb_projective", 16)]
-SIZES = [("spot-1k", 64), ("spot-1k", 128), ("spot-1k", 256), ("spot-1k", 512), ("spot-6k", 256), ("spot-94k", 256)]
+SIZES = [
+    ("spot-1k", 64),
+    ("spot-1k", 128),
+    ("spot-1k", 256),
+    ("spot-1k", 512),
+    ("spot-6k", 256),
+    ("spot-94k", 256),
+]
 
 
 @dataclass
@@ -80,11 +88,17 @@ class Row:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--scenes", nargs="*", help="only these; pictures are then left as they are")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--scenes", nargs="*", help="only these; pictures are then left as they are"
+    )
     parser.add_argument("--loss", default="log-srgb-l1", choices=("log-srgb-l1", "l2"))
     parser.add_argument("--no-peers", action="store_true")
-    parser.add_argument("--sizes", nargs="*", metavar="SCENE:RESOLUTION", help="all of them when none is named")
+    parser.add_argument(
+        "--sizes", nargs="*", metavar="SCENE:RESOLUTION", help="all of them when none is named"
+    )
     parser.add_argument("--force", action="store_true")
     parser.add_argument("--new-references", action="store_true")
     parser.add_argument("--plot", action="store_true")
@@ -102,9 +116,15 @@ def main() -> None:
             cases = [(s, int(r)) for s, r in (c.split(":") for c in arguments.sizes)] or SIZES
         for scene, resolution in cases:
             wanted = [*SETTINGS, *(() if arguments.no_peers else map(peer_name, PEERS))]
-            if not arguments.force and not arguments.new_references and measured(path, scene, resolution, wanted):
+            if (
+                not arguments.force
+                and not arguments.new_references
+                and measured(path, scene, resolution, wanted)
+            ):
                 continue
-            rows = measure(scene, resolution, arguments.loss, not arguments.no_peers, arguments.new_references)
+            rows = measure(
+                scene, resolution, arguments.loss, not arguments.no_peers, arguments.new_references
+            )
             keep(path, rows)
     if not arguments.scenes and not arguments.sizes:
         draw(OUT)
@@ -133,7 +153,9 @@ def measure(scene: str, resolution: int, loss: str, peers: bool, force: bool) ->
             f"{vertices.bias:+.3f}"
         )
 
-    times = milliseconds_of({n: lambda s, q=q: ours.device(q, s) for n, q in SETTINGS.items()}, TIMED)
+    times = milliseconds_of(
+        {n: lambda s, q=q: ours.device(q, s) for n, q in SETTINGS.items()}, TIMED
+    )
     for name, quality in SETTINGS.items():
         add(name, np.stack([ours(quality, seed) for seed in range(REPEATS)]), times[name])
     for integrator, samples in PEERS if peers else ():
@@ -154,7 +176,9 @@ def measured(path: Path, scene: str, resolution: int, estimators: list[str]) -> 
         return False
     with path.open() as file:
         there = {
-            r["estimator"] for r in csv.DictReader(file) if (r["scene"], r["resolution"]) == (scene, str(resolution))
+            r["estimator"]
+            for r in csv.DictReader(file)
+            if (r["scene"], r["resolution"]) == (scene, str(resolution))
         }
     return there.issuperset(estimators)
 
@@ -167,7 +191,8 @@ def errors(gradients: np.ndarray, reference: Truth) -> tuple:
 
 
 def milliseconds_of(work: dict[str, Callable[[int], object]], repeats: int) -> dict[str, float]:
-    """Smallest wall time of each, taken in turns: what else runs on the machine only ever adds to it."""
+    """Smallest wall time of each, taken in turns: what else runs on the machine only ever adds to
+    it."""
     times: dict[str, list[float]] = {name: [] for name in work}
     for seed in range(repeats + 1):
         for name, call in work.items():
@@ -180,8 +205,8 @@ def milliseconds_of(work: dict[str, Callable[[int], object]], repeats: int) -> d
 
 
 def timed(gradient: Callable[[int], np.ndarray], repeats: int) -> tuple[np.ndarray, float]:
-    """Repetitions (R, V, 3), and the smallest time of one in milliseconds: for what is too slow to be run for its time
-    alone."""
+    """Repetitions (R, V, 3), and the smallest time of one in milliseconds: for what is too slow to
+    be run for its time alone."""
     results, times = [], []
     for seed in range(repeats):
         began = time.perf_counter()
@@ -203,7 +228,9 @@ def keep(path: Path, rows: list[Row]) -> None:
     with temporary.open("w", newline="") as file:
         writer = csv.DictWriter(file, list(asdict(rows[0])))
         writer.writeheader()
-        writer.writerows({k: f"{v:.5g}" if isinstance(v, float) else v for k, v in r.items()} for r in every)
+        writer.writerows(
+            {k: f"{v:.5g}" if isinstance(v, float) else v for k, v in r.items()} for r in every
+        )
     temporary.rename(path)
 
 

@@ -1,10 +1,11 @@
-"""The derivative of a sphere's covered area by its size: a number that shows the bias of silhouettes alone.
+"""The derivative of a sphere's covered area by its size: a number that shows the bias of
+silhouettes alone.
 
     python -m experiments.gradient_error.area        # one minute; prints a table
 
-Against central differences (2 % each way) of images with 64 rays per pixel, four views of 64 squared pixels. Beside the
-estimators as they are: silhouette edges with side rays farther away, and pairs that look at no other triangle
-than the one that the front sample sees.
+Against central differences (2 % each way) of images with 64 rays per pixel, four views of 64
+squared pixels. Beside the estimators as they are: silhouette edges with side rays farther away, and
+pairs that look at no other triangle than the one that the front sample sees.
 """
 
 from __future__ import annotations
@@ -45,7 +46,13 @@ def ball(splits: int) -> LatentMesh:
         p, f = split(p, f)
         p *= RADIUS / np.linalg.norm(p, axis=1, keepdims=True)
     f = f.astype(np.int32)
-    return LatentMesh(p.astype(np.float32), f, np.arange(len(p), dtype=np.int32), f, np.zeros((len(p), 2), np.float32))
+    return LatentMesh(
+        p.astype(np.float32),
+        f,
+        np.arange(len(p), dtype=np.int32),
+        f,
+        np.zeros((len(p), 2), np.float32),
+    )
 
 
 def estimated(model: Model, records: mi.Float, grid: Grid, quality: Quality) -> float:
@@ -94,7 +101,9 @@ def main() -> None:
                 value = estimated(model, records, grid, quality)
             column.append(f"{100 * (value / truth - 1):+.1f} %")
         columns.append(column)
-    print("| estimator | " + " | ".join(c[0] for c in columns) + " |\n|---|" + "---|" * len(columns))
+    print(
+        "| estimator | " + " | ".join(c[0] for c in columns) + " |\n|---|" + "---|" * len(columns)
+    )
     for k, name in enumerate(SETTINGS, 1):
         print(f"| {name} | " + " | ".join(c[k] for c in columns) + " |")
 

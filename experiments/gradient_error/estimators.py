@@ -20,7 +20,8 @@ from experiments.gradient_error.problems import BACKGROUND, Problem
 
 
 class ColoredModel(Model):
-    """A model of a problem's mesh with its vertex colours: Mitsuba splits a mesh at the seams of a texture."""
+    """A model of a problem's mesh with its vertex colours: Mitsuba splits a mesh at the seams of a
+    texture."""
 
     def __init__(self, problem: Problem) -> None:
         constants = {"red": 1.0, "green": 1.0, "blue": 1.0}
@@ -36,7 +37,8 @@ class ColoredModel(Model):
 
 
 class Ours:
-    """One problem, ready to be differentiated again and again. ``target`` (P, 3): over the background."""
+    """One problem, ready to be differentiated again and again. ``target`` (P, 3): over the
+    background."""
 
     def __init__(self, problem: Problem, target: NDArray, loss: str) -> None:
         self.loss = LOSSES[loss]
@@ -54,7 +56,8 @@ class Ours:
         return np.array(self.device(quality, seed)).reshape(-1, 3)
 
     def device(self, quality: Quality, seed: int) -> mi.Float:
-        """The same on the device, as a step of a fit computes it, acceleration structure included."""
+        """The same on the device, as a step of a fit computes it, acceleration structure
+        included."""
         # a new array: Mitsuba skips parameters that are the same as before
         self.model.parameters[POSITIONS].value = self.model.positions() + dr.opaque(mi.Float, 0.0)
         self.model.update_scene()

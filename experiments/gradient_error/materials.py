@@ -2,8 +2,9 @@
 
     python -m experiments.gradient_error.materials
 
-Two scenes: a ball whose maps are magnified, and one whose maps are minified (4 to 8 texels per pixel: its gradients
-pass through the mip pyramid). A direction is a smooth wave over all texels of a channel.
+Two scenes: a ball whose maps are magnified, and one whose maps are minified (4 to 8 texels per
+pixel: its gradients pass through the mip pyramid). A direction is a smooth wave over all texels of
+a channel.
 """
 
 from __future__ import annotations
@@ -32,7 +33,10 @@ from experiments.gradient_error.reference import pixel_losses
 
 CHANNELS = ("red", "roughness", "metalness", "normal_x", "normal_y")
 FIELDS, SAMPLES, STEP = 10, 64, 2e-3
-SCENES = {"magnified, 64² texels on 128² pixels": (64, 128), "minified, 512² texels on 64² pixels": (512, 64)}
+SCENES = {
+    "magnified, 64² texels on 128² pixels": (64, 128),
+    "minified, 512² texels on 64² pixels": (512, 64),
+}
 SETTINGS = {
     "1 sample": Quality(1.0, 4, 1),
     "4 samples": Quality(4.0, 8, 4, sample_width=1.0),
@@ -42,7 +46,10 @@ SETTINGS = {
 
 def main() -> None:
     backend.select("cpu")
-    lines = ["| scene | channel | samples per pixel | error | cosine | bias |", "|---|---|---|---|---|---|"]
+    lines = [
+        "| scene | channel | samples per pixel | error | cosine | bias |",
+        "|---|---|---|---|---|---|",
+    ]
     for scene, (size, resolution) in SCENES.items():
         for line in measure(scene, size, resolution):
             print(line, flush=True)
@@ -56,7 +63,10 @@ def wavy_maps(size: int) -> dict[str, NDArray[np.float32]]:
     """Smooth maps that vary by about a fifth, a few waves across."""
     v, u = np.meshgrid(*[(np.arange(size) + 0.5) / size * 2 * np.pi] * 2, indexing="ij")
     middle = {"red": 0.5, "green": 0.4, "blue": 0.3, "roughness": 0.45, "metalness": 0.4}
-    maps = {k: m + 0.15 * np.sin((2 + i) * u + i) * np.cos(3 * v - i) for i, (k, m) in enumerate(middle.items())}
+    maps = {
+        k: m + 0.15 * np.sin((2 + i) * u + i) * np.cos(3 * v - i)
+        for i, (k, m) in enumerate(middle.items())
+    }
     maps["normal_x"] = 0.2 * np.sin(4 * u) * np.cos(2 * v)
     maps["normal_y"] = 0.2 * np.cos(3 * u + 1) * np.sin(4 * v)
     maps["normal_z"] = np.sqrt(1 - maps["normal_x"] ** 2 - maps["normal_y"] ** 2)
@@ -70,7 +80,9 @@ def smooth_texel_fields(codec: TexelCodec, channel: str, count: int) -> NDArray[
     out = np.zeros((count, codec.size, codec.size, codec.packed), np.float32)
     for k in range(count):
         a, b = rng.uniform(-4, 4, 2)
-        out[k, ..., codec.channels.index(channel)] = np.sin(2 * np.pi * (a * u + b * v + rng.random()))
+        out[k, ..., codec.channels.index(channel)] = np.sin(
+            2 * np.pi * (a * u + b * v + rng.random())
+        )
     return out.reshape(count, -1)
 
 
@@ -80,7 +92,10 @@ def measure(scene: str, size: int, resolution: int) -> list[str]:
     maps = wavy_maps(size)
     model = Model(mesh, {**maps}, frozenset(("normal", "material")), Rates())
     assert model.codec is not None
-    grid, views = Grid(1, resolution), ViewSampler((0.0, 0.0, 0.0), 1.0, seed=2, light_spread=40.0).draw(0, 1)
+    grid, views = (
+        Grid(1, resolution),
+        ViewSampler((0.0, 0.0, 0.0), 1.0, seed=2, light_spread=40.0).draw(0, 1),
+    )
     records = views.records()
     parameter = model.parameters[TEXELS]
     start = np.array(parameter.value)
@@ -90,7 +105,9 @@ def measure(scene: str, size: int, resolution: int) -> list[str]:
         parameter.value = mi.Float(stored)
         with dr.suspend_grad():
             surface, layer = model.surface(model.positions()), model.fitted_layer()
-            flat = render_image(model.scene, surface, model.maps(layer), records, grid, SAMPLES, SAMPLES**-0.5)
+            flat = render_image(
+                model.scene, surface, model.maps(layer), records, grid, SAMPLES, SAMPLES**-0.5
+            )
         pixels = np.array(flat).reshape(-1, 4).astype(np.float64)
         return pixels[:, :3] + (1 - pixels[:, 3:]) * behind
 
@@ -98,13 +115,18 @@ def measure(scene: str, size: int, resolution: int) -> list[str]:
     target = image(brighter.ravel())
     rgba = np.ones((len(target), 4), np.float32)
     rgba[:, :3] = target
-    inputs = StepInputs(views, Targets(mi.Float(rgba.ravel())), behind[None].astype(np.float32), 0.0, 0.0, 0)
+    inputs = StepInputs(
+        views, Targets(mi.Float(rgba.ravel())), behind[None].astype(np.float32), 0.0, 0.0, 0
+    )
     lines = []
     for channel in CHANNELS:
         fields = smooth_texel_fields(model.codec, channel, FIELDS)
         truth = np.zeros(FIELDS)
         for k, field in enumerate(fields):
-            values = [pixel_losses("log-srgb-l1", image(start + s * STEP * field), target) for s in (1, -1)]
+            values = [
+                pixel_losses("log-srgb-l1", image(start + s * STEP * field), target)
+                for s in (1, -1)
+            ]
             truth[k] = (values[0] - values[1]) / (2 * STEP) / (3 * grid.pixels)
         parameter.value = mi.Float(start)
         for name, quality in SETTINGS.items():

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True)
 class Error:
-    """``relative``: |g - t| / |t|, root mean square over repetitions; ``cosine``: mean over them; ``bias``:
-    projection of the mean gradient on the truth, less one (0.02: 2 % too long)."""
+    """``relative``: |g - t| / |t|, root mean square over repetitions; ``cosine``: mean over them;
+    ``bias``: projection of the mean gradient on the truth, less one (0.02: 2 % too long)."""
 
     relative: float
     cosine: float
@@ -20,7 +20,10 @@ class Error:
 
 def error_of(repetitions: NDArray, truth: NDArray) -> Error:
     """``repetitions`` (R, N): independent estimates; ``truth`` (N,)."""
-    g, t = repetitions.reshape(len(repetitions), -1).astype(np.float64), truth.ravel().astype(np.float64)
+    g, t = (
+        repetitions.reshape(len(repetitions), -1).astype(np.float64),
+        truth.ravel().astype(np.float64),
+    )
     norm = np.linalg.norm(t)
     relative = np.sqrt(np.mean(np.sum((g - t) ** 2, axis=1))) / norm
     cosine = np.mean(g @ t / (np.linalg.norm(g, axis=1) * norm + 1e-300))

@@ -13,8 +13,9 @@ from experiments.gradient_error.problems import BACKGROUND, Problem
 
 
 class Peer:
-    """One problem in Mitsuba. ``integrator``: "direct_projective" or "prb_projective" (of depth two, which is the
-    same light). Shadow boundaries are not sampled: the light at the eye casts no visible shadow."""
+    """One problem in Mitsuba. ``integrator``: "direct_projective" or "prb_projective" (of depth
+    two, which is the same light). Shadow boundaries are not sampled: the light at the eye casts no
+    visible shadow."""
 
     def __init__(self, problem: Problem, target: NDArray, loss: str, integrator: str) -> None:
         bsdf = {
@@ -26,7 +27,9 @@ class Peer:
         views = problem.views
         # both sides reflect: open meshes show their backs
         bsdf = {"type": "twosided", "nested": bsdf}
-        mesh = mitsuba_peer.mesh("mesh", problem.positions, problem.faces, bsdf, vertex_color=problem.colors)
+        mesh = mitsuba_peer.mesh(
+            "mesh", problem.positions, problem.faces, bsdf, vertex_color=problem.colors
+        )
         scene = {
             "type": "scene",
             "mesh": mesh,
@@ -45,7 +48,9 @@ class Peer:
 
     def image(self, samples: int, seed: int = 0) -> NDArray[np.float32]:
         """The image alone (P, 3)."""
-        image = mi.render(self.scene, sensor=self.sensor, integrator=self.integrator, spp=samples, seed=seed)
+        image = mi.render(
+            self.scene, sensor=self.sensor, integrator=self.integrator, spp=samples, seed=seed
+        )
         return np.array(image).reshape(-1, 3)
 
     def device(self, samples: int, seed: int) -> mi.Float:
@@ -55,7 +60,12 @@ class Peer:
         self.parameters["mesh.vertex_positions"] = positions
         self.parameters.update()
         image = mi.render(
-            self.scene, self.parameters, sensor=self.sensor, integrator=self.integrator, spp=samples, seed=seed
+            self.scene,
+            self.parameters,
+            sensor=self.sensor,
+            integrator=self.integrator,
+            spp=samples,
+            seed=seed,
         )
         color = dr.unravel(mi.Color3f, image.array)
         loss = self.loss(color, mi.Color3f(*self.target))

@@ -14,7 +14,8 @@ IMAGES = Path("docs/images")
 
 
 def draw(folder: Path) -> None:
-    """Markdown tables beside the CSV files in ``folder``, pictures and the CSV files into docs/images."""
+    """Markdown tables beside the CSV files in ``folder``, pictures and the CSV files into
+    docs/images."""
     matplotlib.use("agg")
     for name in ("vertices", "vertices_l2", "sizes", "sizes_l2"):
         path = folder / f"{name}.csv"
@@ -53,7 +54,9 @@ def error_against_time(rows: list[dict[str, str]], path: Path) -> None:
     cases = list(dict.fromkeys((r["scene"], r["resolution"]) for r in rows))
     columns = min(4, len(cases))
     lines = -(-len(cases) // columns)
-    figure, axes = plt.subplots(lines, columns, figsize=(3.4 * columns, 2.9 * lines), squeeze=False, sharey=True)
+    figure, axes = plt.subplots(
+        lines, columns, figsize=(3.4 * columns, 2.9 * lines), squeeze=False, sharey=True
+    )
     for axis in axes.ravel()[len(cases) :]:
         axis.axis("off")
     for axis, case in zip(axes.ravel(), cases, strict=False):
@@ -65,7 +68,10 @@ def error_against_time(rows: list[dict[str, str]], path: Path) -> None:
             own = [r for r in here if r["estimator"].startswith(family)]
             if not own:
                 continue
-            x, y = [float(r["milliseconds"]) for r in own], [float(r["fields_relative"]) for r in own]
+            x, y = (
+                [float(r["milliseconds"]) for r in own],
+                [float(r["fields_relative"]) for r in own],
+            )
             axis.loglog(x, y, marker=marker, color=colour, label=family, linewidth=1, markersize=5)
         axis.axhline(0.08, color="black", linewidth=0.6, linestyle=":")
         axis.axhline(float(here[0]["reference_fields"]), color="#bbbbbb", linewidth=0.8)

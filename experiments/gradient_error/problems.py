@@ -1,8 +1,9 @@
 """The scenes of the gradient tables: one view each of a mesh, its target, and what lies behind.
 
-Every case of visibility has a scene of its own. All are lit from the eye, because Mitsuba's integrators
-trace shadows and ours does not: from there no visible point is in shadow. That is the hard case, too: smooth objects
-are dark where their outline is, and the logarithmic loss is steep in the dark.
+Every case of visibility has a scene of its own. All are lit from the eye, because Mitsuba's
+integrators trace shadows and ours does not: from there no visible point is in shadow. That is the
+hard case, too: smooth objects are dark where their outline is, and the logarithmic loss is steep in
+the dark.
 """
 
 from __future__ import annotations
@@ -32,9 +33,9 @@ ASSETS = Path(__file__).resolve().parents[3] / "shared" / "assets"
 
 @dataclass(frozen=True)
 class Problem:
-    """``positions`` (V, 3), ``faces`` (F, 3) welded, ``colors`` (V, 3) linear; ``target_positions`` and
-    ``target_colors`` the same mesh as it should look; one view of ``resolution`` squared pixels.
-    ``step``: largest displacement of a finite difference, in pixels."""
+    """``positions`` (V, 3), ``faces`` (F, 3) welded, ``colors`` (V, 3) linear; ``target_positions``
+    and ``target_colors`` the same mesh as it should look; one view of ``resolution`` squared
+    pixels. ``step``: largest displacement of a finite difference, in pixels."""
 
     name: str
     positions: NDArray[np.float32]
@@ -77,12 +78,16 @@ class Problem:
         """Surface with vertex colours (no texture: Mitsuba splits a mesh at its UV seams)."""
         padded = np.zeros((len(colors), 4), np.float32)
         padded[:, :3] = colors
-        return replace(topology.surface(positions), frames=None, corners=None, colors=mi.Float(padded.ravel()))
+        return replace(
+            topology.surface(positions), frames=None, corners=None, colors=mi.Float(padded.ravel())
+        )
 
 
-def smooth_fields(positions: NDArray, count: int, seed: int, highest: float = 5.0) -> NDArray[np.float64]:
-    """(count, V, 3) smooth deformation fields: each a random plane wave in a random direction, at most
-    ``highest`` radians per unit, of largest displacement 1."""
+def smooth_fields(
+    positions: NDArray, count: int, seed: int, highest: float = 5.0
+) -> NDArray[np.float64]:
+    """(count, V, 3) smooth deformation fields: each a random plane wave in a random direction, at
+    most ``highest`` radians per unit, of largest displacement 1."""
     rng = np.random.default_rng(seed)
     fields = []
     for _ in range(count):
@@ -103,7 +108,9 @@ def make_problem(name: str, resolution: int = 128) -> Problem:
     """The scene of that name."""
     positions, faces, eye = _SHAPES[name]()
     positions = np.asarray(positions, np.float64)
-    colors = 0.45 + 0.35 * np.sin(positions @ np.array([[3.1, 1.3, 0.4], [0.7, 2.9, 1.7], [1.9, 0.3, 3.3]]).T)
+    colors = 0.45 + 0.35 * np.sin(
+        positions @ np.array([[3.1, 1.3, 0.4], [0.7, 2.9, 1.7], [1.9, 0.3, 3.3]]).T
+    )
     wave = smooth_fields(positions, 1, 99, 3.0)[0]
     target = positions + 0.04 * wave
     shade = 0.9 + 0.1 * np.sin(positions @ np.array([1.7, 2.3, 0.9]))
@@ -126,7 +133,11 @@ Shape = tuple[NDArray, NDArray, tuple[float, float, float]]
 
 
 def _triangle() -> Shape:
-    return np.array([[-0.7, -0.6, 0.0], [0.8, -0.45, 0.2], [0.05, 0.75, -0.1]]), np.array([[0, 1, 2]]), (0, 0, 1)
+    return (
+        np.array([[-0.7, -0.6, 0.0], [0.8, -0.45, 0.2], [0.05, 0.75, -0.1]]),
+        np.array([[0, 1, 2]]),
+        (0, 0, 1),
+    )
 
 
 def _ball() -> Shape:
@@ -145,7 +156,9 @@ def _grid(n: int, place: Callable[[NDArray, NDArray], NDArray]) -> tuple[NDArray
 
 def _interior() -> Shape:
     """A wavy sheet larger than the image: no outline anywhere."""
-    p, f = _grid(24, lambda u, v: np.stack([1.6 * u, 1.6 * v, 0.15 * np.sin(3 * u + 1) * np.cos(4 * v)], 1))
+    p, f = _grid(
+        24, lambda u, v: np.stack([1.6 * u, 1.6 * v, 0.15 * np.sin(3 * u + 1) * np.cos(4 * v)], 1)
+    )
     return p, f, (0, 0, 1)
 
 
@@ -169,7 +182,9 @@ def _bowl() -> Shape:
         r = np.maximum(np.abs(u), np.abs(v))
         angle = np.arctan2(v, u)
         polar = r * 0.55 * np.pi
-        return 0.8 * np.stack([np.sin(polar) * np.cos(angle), -np.cos(polar) + 0.3, np.sin(polar) * np.sin(angle)], 1)
+        return 0.8 * np.stack(
+            [np.sin(polar) * np.cos(angle), -np.cos(polar) + 0.3, np.sin(polar) * np.sin(angle)], 1
+        )
 
     p, f = _grid(18, place)
     return p, f[:, ::-1], (0.2, 0.7, 1)

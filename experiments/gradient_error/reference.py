@@ -1,8 +1,8 @@
 """The truth: central finite differences of the loss of a heavily supersampled, box-filtered image.
 
-Only pixels that a change can touch are rendered. All differences of one half share their sample positions, random by
-pixel; the two halves have others, so that their disagreement bounds the reference's own error. Cached by
-the hash of everything that made it, this file's source included.
+Only pixels that a change can touch are rendered. All differences of one half share their sample
+positions, random by pixel; the two halves have others, so that their disagreement bounds the
+reference's own error. Cached by the hash of everything that made it, this file's source included.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ CACHE = Path("out/gradient_error/cache")
 FIELDS = 12
 VERTICES = 20
 FIELD_SAMPLES, TARGET_SAMPLES = 128, 1024
-"""At 128 squared pixels; at others so many that a row of pixels has as many: what a silhouette sweeps over, and so the
-noise of a difference, grows with its length in pixels."""
+"""At 128 squared pixels; at others so many that a row of pixels has as many: what a silhouette
+sweeps over, and so the noise of a difference, grows with its length in pixels."""
 
 VERTEX_SAMPLES = (256, 1024)
 """Least and most; in between as many as VERTEX_RAYS rays allow."""
@@ -39,8 +39,9 @@ CHUNK = 1 << 20
 
 @dataclass(frozen=True)
 class Truth:
-    """``target`` (P, 3): the target image over the background. ``fields`` (N, V, 3) unit displacements and
-    ``by_field`` (2, N): dLoss along them, by each half. ``vertices`` (K,) and ``by_vertex`` (2, K, 3)."""
+    """``target`` (P, 3): the target image over the background. ``fields`` (N, V, 3) unit
+    displacements and ``by_field`` (2, N): dLoss along them, by each half. ``vertices`` (K,) and
+    ``by_vertex`` (2, K, 3)."""
 
     target: NDArray[np.float32]
     fields: NDArray[np.float32]
@@ -71,8 +72,8 @@ class Supersampler:
             dr.eval(self.surface.vertices, self.surface.colors)
 
     def image(self, pixels: NDArray, samples: int, half: int) -> NDArray[np.float64]:
-        """Linear RGB over the background of the given pixels (P,), each the mean of ``samples`` rays: (P, 3).
-        ``half`` picks one of independent sets of sample positions."""
+        """Linear RGB over the background of the given pixels (P,), each the mean of ``samples``
+        rays: (P, 3). ``half`` picks one of independent sets of sample positions."""
         per_pass = max(1, CHUNK // len(pixels))
         offsets = rays.sub_pixel_offsets(samples)
         total = np.zeros((len(pixels), 4))
@@ -103,7 +104,14 @@ class Supersampler:
         if dr.width(kept):
             hits, k = rays.keep(hits, kept), dr.gather(mi.UInt32, k, kept)
             with dr.suspend_grad():
-                c = shade(self.surface, self.problem.maps, self.records, hits, size, dr.opaque(mi.Float, 1 / 16))
+                c = shade(
+                    self.surface,
+                    self.problem.maps,
+                    self.records,
+                    hits,
+                    size,
+                    dr.opaque(mi.Float, 1 / 16),
+                )
             value = mi.ArrayXf([c.x, c.y, c.z, dr.full(mi.Float, 1, dr.width(kept))])
             dr.scatter_reduce(dr.ReduceOp.Add, image, value, k, mode=dr.ReduceMode.Local)
         return np.array(image).reshape(n, 4).astype(np.float64)
@@ -112,7 +120,9 @@ class Supersampler:
 def tone(x: NDArray) -> NDArray:
     """The tone map of the log-sRGB loss, in double precision."""
     y = np.log1p(np.maximum(x, 0))
-    return np.where(y <= 0.0031308, 12.92 * y, 1.055 * np.maximum(y, 0.0031308) ** (1 / 2.4) - 0.055)
+    return np.where(
+        y <= 0.0031308, 12.92 * y, 1.055 * np.maximum(y, 0.0031308) ** (1 / 2.4) - 0.055
+    )
 
 
 def pixel_losses(loss: str, image: NDArray, target: NDArray) -> float:
@@ -140,11 +150,16 @@ def truth(problem: Problem, loss: str, force: bool = False) -> Truth:
 def _sources() -> bytes:
     """Source code of everything that the reference's images depend on."""
     modules = (rays, deferred, surface, material, brdf, mesh_ops)
-    return b"".join(Path(str(m.__file__)).read_bytes() for m in modules) + Path(__file__).read_bytes()
+    return (
+        b"".join(Path(str(m.__file__)).read_bytes() for m in modules) + Path(__file__).read_bytes()
+    )
 
 
 def _fingerprint(problem: Problem) -> bytes:
-    parts = [repr(v).encode() if not isinstance(v, np.ndarray) else v.tobytes() for v in vars(problem).values()]
+    parts = [
+        repr(v).encode() if not isinstance(v, np.ndarray) else v.tobytes()
+        for v in vars(problem).values()
+    ]
     return b"".join(parts)
 
 
@@ -165,7 +180,9 @@ def _compute(problem: Problem, loss: str) -> Truth:
         for s, sign in enumerate((1, -1)):
             view.move(start + sign * step * change)
             for half in range(2):
-                values[half, s] = pixel_losses(loss, view.image(pixels, samples, half), target[pixels])
+                values[half, s] = pixel_losses(
+                    loss, view.image(pixels, samples, half), target[pixels]
+                )
         return (values[:, 0] - values[:, 1]) / (2 * step) * scale
 
     fields = smooth_fields(problem.positions, FIELDS, 1).astype(np.float32)
@@ -183,7 +200,8 @@ def _compute(problem: Problem, loss: str) -> Truth:
 
 
 def _near(view: Supersampler) -> NDArray[np.int64]:
-    """The pixels that see the object, and those up to three pixels away: no other changes with it."""
+    """The pixels that see the object, and those up to three pixels away: no other changes with
+    it."""
     n = view.problem.resolution
     rgb = view.image(np.arange(n * n), 16, 0)
     seen = np.abs(rgb - np.array(BACKGROUND)).max(1) > 1e-6
@@ -196,21 +214,25 @@ def _vertices_to_test(problem: Problem, view: Supersampler) -> NDArray[np.int64]
     n = problem.resolution
     x = dr.tile(dr.arange(mi.Float, n), n) + 0.5
     y = dr.repeat(dr.arange(mi.Float, n), n) + 0.5
-    hits = rays.trace(view.scene, view.records, dr.zeros(mi.UInt32, n * n), x, y, dr.opaque(mi.Float, n))
+    hits = rays.trace(
+        view.scene, view.records, dr.zeros(mi.UInt32, n * n), x, y, dr.opaque(mi.Float, n)
+    )
     triangle = np.array(hits.triangle)
     seen = np.unique(problem.faces[np.unique(triangle[triangle != MISS])])
     return np.sort(np.random.default_rng(3).permutation(seen)[:VERTICES])
 
 
 def _reach(problem: Problem, vertices: NDArray) -> list[NDArray]:
-    """Pixels that moving each vertex can change: the box around its two-ring (positions of the first ring,
-    normals of the second), two pixels wider."""
+    """Pixels that moving each vertex can change: the box around its two-ring (positions of the
+    first ring, normals of the second), two pixels wider."""
     views = problem.views
     v = problem.positions - views.eye[0]
     depth = v @ views.forward[0]
     squared = np.sum(views.right[0] ** 2)
     half = problem.resolution / 2
-    at = np.stack([v @ a[0] / (depth * squared) * half + half for a in (views.right, views.down)], 1)
+    at = np.stack(
+        [v @ a[0] / (depth * squared) * half + half for a in (views.right, views.down)], 1
+    )
     out = []
     for vertex in vertices:
         ring = problem.faces[(problem.faces == vertex).any(1)]

@@ -1,11 +1,12 @@
-"""Quality on real assets, by a neutral renderer: start and fitted result against what other tools reach.
+"""Quality on real assets, by a neutral renderer: start and fitted result against what other tools
+reach.
 
     python -m experiments.quality [--preset default] [--rows spot:1404,...] [--views 24]
 
-Needs the folder ``../shared/judge`` (a renderer that is not ours, reference GLBs and the other tools' scores in
-``peers.json``). Results are kept in ``out/quality/<preset>.json``, one row at a time, so that a broken run
-goes on where it stopped; a row of other views is another row. ``--table`` prints the table for docs/quality.md from
-what is there.
+Needs the folder ``../shared/judge`` (a renderer that is not ours, reference GLBs and the other
+tools' scores in ``peers.json``). Results are kept in ``out/quality/<preset>.json``, one row at a
+time, so that a broken run goes on where it stopped; a row of other views is another row.
+``--table`` prints the table for docs/quality.md from what is there.
 """
 
 from __future__ import annotations

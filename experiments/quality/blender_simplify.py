@@ -38,7 +38,9 @@ def main(high: str, triangles: int, out: str) -> None:
     bpy.ops.object.shade_smooth()
     bpy.ops.object.select_all(action="DESELECT")
     mesh.select_set(True)
-    bpy.ops.export_scene.gltf(filepath=out, use_selection=True, export_normals=True, export_materials="NONE")
+    bpy.ops.export_scene.gltf(
+        filepath=out, use_selection=True, export_normals=True, export_materials="NONE"
+    )
 
 
 if __name__ == "__main__":

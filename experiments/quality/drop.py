@@ -2,12 +2,13 @@
 
     python -m experiments.quality.drop --blender BPY/bin/python [--rows spot:1404,...] [--seeds 4]
 
-The PSNR of our result and of Blender's (decimate, unwrap, Cycles bake) against the same reference, by our own
-``compare`` and by the neutral renderer in ``../shared/judge``. Both look from other places under other lights, so
-only the difference of the two drops says something: fitting to images of our own renderer could make a result that
-suits that renderer alone. ``--seeds``: sets of 24 views, whose means are taken; with several, the table says how far
-the difference of the two drops is known (standard error over the sets). Needs the results of ``python -m
-experiments.quality`` and Blender's package in an environment of its own (see experiments/baking). What is on disk in
+The PSNR of our result and of Blender's (decimate, unwrap, Cycles bake) against the same reference,
+by our own ``compare`` and by the neutral renderer in ``../shared/judge``. Both look from other
+places under other lights, so only the difference of the two drops says something: fitting to images
+of our own renderer could make a result that suits that renderer alone. ``--seeds``: sets of 24
+views, whose means are taken; with several, the table says how far the difference of the two drops
+is known (standard error over the sets). Needs the results of ``python -m experiments.quality`` and
+Blender's package in an environment of its own (see experiments/baking). What is on disk in
 ``out/drop`` is not made again.
 """
 
@@ -48,14 +49,24 @@ def blender_result(python: str, reference: Path, triangles: int, stem: Path) -> 
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
     radius = Placement.around(load(reference).points()).scale
     bake = here.parent / "baking" / "blender_bake.py"
-    command = [python, str(bake), str(reference), str(low), str(maps), str(SIZE), str(REACH * radius), "4"]
+    command = [
+        python,
+        str(bake),
+        str(reference),
+        str(low),
+        str(maps),
+        str(SIZE),
+        str(REACH * radius),
+        "4",
+    ]
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
     save(Asset((maps_of_blender(load(low).meshes[0], maps),), "blender"), result)
     return result
 
 
 def run_row(python: str, asset: str, triangles: int, seeds: int) -> dict:
-    """Scores of both results in both renderers: PSNR by tool, by renderer, one for each set of views."""
+    """Scores of both results in both renderers: PSNR by tool, by renderer, one for each set of
+    views."""
     from appearance_opt import compare
 
     FOLDER.mkdir(parents=True, exist_ok=True)
@@ -67,17 +78,22 @@ def run_row(python: str, asset: str, triangles: int, seeds: int) -> dict:
         "ours": str(ours),
         "blender": str(blender_result(python, reference, triangles, stem)),
     }
-    row: dict = {"asset": asset, "triangles": triangles} | {n: {"compare": [], "judge": []} for n in candidates}
+    row: dict = {"asset": asset, "triangles": triangles} | {
+        n: {"compare": [], "judge": []} for n in candidates
+    }
     for k in range(seeds):
         judged = judge(reference, candidates, stem, VIEWS, seed=FIRST_SEED + k)
         for name, path in candidates.items():
             row[name]["judge"].append(judged[name]["psnr_cov"])
-            row[name]["compare"].append(compare(reference, path, views=VIEWS, seed=k).metrics.psnr_covered)
+            row[name]["compare"].append(
+                compare(reference, path, views=VIEWS, seed=k).metrics.psnr_covered
+            )
     return row
 
 
 def table_line(row: dict) -> str:
-    """Markdown: means over the sets of views, and how much more ours drops, with its standard error."""
+    """Markdown: means over the sets of views, and how much more ours drops, with its standard
+    error."""
     drops, cells = [], []
     for name in ("ours", "blender"):
         own, judged = (np.array(row[name][k]) for k in ("compare", "judge"))
@@ -96,7 +112,9 @@ def main() -> None:
     a = parser.parse_args()
     needs_judge()
     wanted = {tuple(r.split(":")) for r in a.rows.split(",")}
-    print("| asset, triangles | ours: compare, judge, drop (dB) | Blender: compare, judge, drop (dB) | more |")
+    print(
+        "| asset, triangles | ours: compare, judge, drop (dB) | Blender: compare, judge, drop (dB) | more |"
+    )
     print("|---|---|---|---|")
     rows = []
     for asset, _, triangles in ROWS:

@@ -2,11 +2,12 @@
 
     python -m experiments.robustness [--kinds kills,interrupts,deaths,full] [--count 100] [--suffixes .glb,.gltf]
 
-``kills``: SIGKILL at random moments of a run over an older result, then the same command with --resume. ``interrupts``:
-SIGINT and SIGTERM, half of each. ``deaths``: killed at each call that changes the disk. ``full``: no room left from
-each such call on. After each, no file under a final name may be half written, or of another version than the file that
-refers to it, and inputs are as they were. Rows go to ``out/robustness/results_*.json`` and are printed. Needs nothing
-but a C compiler; kills are shared out among the suffixes.
+``kills``: SIGKILL at random moments of a run over an older result, then the same command with
+--resume. ``interrupts``: SIGINT and SIGTERM, half of each. ``deaths``: killed at each call that
+changes the disk. ``full``: no room left from each such call on. After each, no file under a final
+name may be half written, or of another version than the file that refers to it, and inputs are as
+they were. Rows go to ``out/robustness/results_*.json`` and are printed. Needs nothing but a C
+compiler; kills are shared out among the suffixes.
 """
 
 from __future__ import annotations
@@ -31,9 +32,10 @@ STEPS = {"kills": 12, "interrupts": 12, "deaths": 2, "full": 2}
 
 @dataclass
 class Row:
-    """``runs``; of these ``cut``: were they really cut short? ``codes``: how they ended; ``faults``: what must not be;
-    ``lost``: largest difference of a resumed run from the whole one (dB); ``equal``: resumed runs whose files are
-    those of the whole one byte by byte; ``left``: temporary files that outlived the next run."""
+    """``runs``; of these ``cut``: were they really cut short? ``codes``: how they ended;
+    ``faults``: what must not be; ``lost``: largest difference of a resumed run from the whole one
+    (dB); ``equal``: resumed runs whose files are those of the whole one byte by byte; ``left``:
+    temporary files that outlived the next run."""
 
     kind: str
     suffix: str
@@ -67,7 +69,11 @@ def kills(case: Case, count: int, seed: int) -> Row:
     row = Row("kills", case.suffix)
     for moment in np.random.default_rng(seed).random(count):
         case.reset()
-        ended = runs.run(case.folder, *case.command, before=runs.after(moment * case.whole.seconds, signal.SIGKILL))
+        ended = runs.run(
+            case.folder,
+            *case.command,
+            before=runs.after(moment * case.whole.seconds, signal.SIGKILL),
+        )
         row.ended(ended)
         row.cut += ended.code < 0
         row.faults += case.faults_in()
@@ -80,7 +86,9 @@ def interrupts(case: Case, count: int, seed: int) -> Row:
     for k, moment in enumerate(np.random.default_rng(seed).random(count)):
         case.reset()
         how = (signal.SIGINT, signal.SIGTERM)[k % 2]
-        ended = runs.run(case.folder, *case.command, before=runs.after(moment * case.whole.seconds, how))
+        ended = runs.run(
+            case.folder, *case.command, before=runs.after(moment * case.whole.seconds, how)
+        )
         row.ended(ended)
         row.cut += "interrupted" in ended.text
         if ended.code not in (0, 130):
@@ -100,7 +108,9 @@ def deaths(case: Case) -> Row:
     row = Row("deaths", case.suffix)
     for call in range(1, calls_of(case) + 1):
         case.reset()
-        ended = runs.run(case.folder, *case.command, before=runs.fault(case.folder, call, kill=True))
+        ended = runs.run(
+            case.folder, *case.command, before=runs.fault(case.folder, call, kill=True)
+        )
         row.ended(ended)
         row.cut += ended.code < 0
         row.faults += [f"call {call}: {f}" for f in case.faults_in()]
@@ -114,7 +124,9 @@ def full(case: Case) -> Row:
     row = Row("full", case.suffix)
     for call in range(1, calls_of(case) + 1):
         case.reset()
-        ended = runs.run(case.folder, *case.command, before=runs.fault(case.folder, call, kill=False))
+        ended = runs.run(
+            case.folder, *case.command, before=runs.fault(case.folder, call, kill=False)
+        )
         row.ended(ended)
         row.cut += ended.code != 0
         if ended.code not in (0, 2) or (ended.code == 2 and ended.text.count("error: ") != 1):
@@ -141,12 +153,15 @@ def main() -> None:
         for kind in given.kinds.split(","):
             case = Case(FOLDER / f"{kind}{suffix}", suffix, STEPS[kind])
             print(
-                f"{kind} {suffix}: {case.whole.seconds:.1f} s a run, {calls_of(case)} changes of the disk", flush=True
+                f"{kind} {suffix}: {case.whole.seconds:.1f} s a run, {calls_of(case)} changes of the disk",
+                flush=True,
             )
             if kind in ("deaths", "full"):
                 row = {"deaths": deaths, "full": full}[kind](case)
             else:
-                row = {"kills": kills, "interrupts": interrupts}[kind](case, given.count // len(suffixes), given.seed)
+                row = {"kills": kills, "interrupts": interrupts}[kind](
+                    case, given.count // len(suffixes), given.seed
+                )
             rows.append(row)
             path.write_text(json.dumps([asdict(r) for r in rows], indent=1))
             print(table([row]), *row.faults, sep="\n", flush=True)

@@ -2,9 +2,10 @@
 
     python -m experiments.robustness.mutations [--count 500] [--formats GLB,OBJ,...] [--first 0]
 
-What is done to them is in ``tests/fuzz/mutators.py``; which files they are depends on their numbers alone. Each is read
-in a process that may die, hang (20 seconds) or take too much memory (2 GiB). Prints the table of the page, and each
-fault with the number of its file. Needs the packages of the extra "dev".
+What is done to them is in ``tests/fuzz/mutators.py``; which files they are depends on their numbers
+alone. Each is read in a process that may die, hang (20 seconds) or take too much memory (2 GiB).
+Prints the table of the page, and each fault with the number of its file. Needs the packages of the
+extra "dev".
 """
 
 from __future__ import annotations
@@ -28,7 +29,9 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=0, help="number of the first file")
     parser.add_argument("--formats", default=",".join(SEEDS), help=f"of {list(SEEDS)}")
     options = parser.parse_args()
-    print("| format | files | read | refused | faults | slowest | peak memory |\n|---|---|---|---|---|---|---|")
+    print(
+        "| format | files | read | refused | faults | slowest | peak memory |\n|---|---|---|---|---|---|---|"
+    )
     for kind in options.formats.split(","):
         tally = run(kind, options.count, options.first)
         print(row(tally), flush=True)

@@ -1,7 +1,7 @@
 """Many runs of one small job, each in a process of its own that is forked when all is imported.
 
-Dr.Jit computes in one thread here: runs of one job are then equal to the last bit, so that any file that is not of the
-old result or of the new one, byte by byte, is found.
+Dr.Jit computes in one thread here: runs of one job are then equal to the last bit, so that any file
+that is not of the old result or of the new one, byte by byte, is found.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ OLD = ("--steps", "0")
 
 @dataclass(frozen=True)
 class Ended:
-    """How a run ended: ``code`` is negative for the signal that ended it; ``text``: what it said; ``calls``: how often
-    it changed the disk; ``seconds`` of computing."""
+    """How a run ended: ``code`` is negative for the signal that ended it; ``text``: what it said;
+    ``calls``: how often it changed the disk; ``seconds`` of computing."""
 
     code: int
     text: str
@@ -49,7 +49,8 @@ class Ended:
 
 
 def prepare() -> None:
-    """Import everything that a run needs, so that it costs the forked processes nothing. No thread is started."""
+    """Import everything that a run needs, so that it costs the forked processes nothing. No thread
+    is started."""
     backend.select("cpu")
     simplify.CHECKPOINT_SECONDS = 0.0
     for module in pkgutil.walk_packages(appearance_opt.__path__, "appearance_opt."):
@@ -100,7 +101,9 @@ def run(folder: Path, *more: str, before: Callable[[], None] = lambda: None) -> 
     with os.fdopen(read) as file:
         calls = file.read()
     code = os.waitstatus_to_exitcode(status)
-    return Ended(code, log.read_text(errors="replace"), int(calls or 0), usage.ru_utime + usage.ru_stime)
+    return Ended(
+        code, log.read_text(errors="replace"), int(calls or 0), usage.ru_utime + usage.ru_stime
+    )
 
 
 def after(seconds: float, number: signal.Signals) -> Callable[[], None]:
@@ -117,7 +120,8 @@ def after(seconds: float, number: signal.Signals) -> Callable[[], None]:
 
 
 def fault(folder: Path, call: int, *, kill: bool) -> Callable[[], None]:
-    """From the call on that changes the disk under ``folder`` after so many others: no room (or death)."""
+    """From the call on that changes the disk under ``folder`` after so many others: no room (or
+    death)."""
 
     def set_fault() -> None:
         faults = _faults()
@@ -128,7 +132,8 @@ def fault(folder: Path, call: int, *, kill: bool) -> Callable[[], None]:
 
 
 def with_faults() -> None:
-    """Start this program again with the library that makes faults, if it is not loaded. Needs a C compiler."""
+    """Start this program again with the library that makes faults, if it is not loaded. Needs a C
+    compiler."""
     if _faults() is not None:
         return
     if "LD_PRELOAD" in os.environ:
@@ -139,9 +144,15 @@ def with_faults() -> None:
     if compiler is None:
         raise SystemExit("this experiment needs a C compiler (cc)")
     os.spawnv(
-        os.P_WAIT, compiler, [compiler, "-shared", "-fPIC", "-O1", "-w", "-o", str(library), str(SOURCES), "-ldl"]
+        os.P_WAIT,
+        compiler,
+        [compiler, "-shared", "-fPIC", "-O1", "-w", "-o", str(library), str(SOURCES), "-ldl"],
     )
-    os.execve(sys.executable, [sys.executable, *sys.orig_argv[1:]], {**os.environ, "LD_PRELOAD": str(library)})
+    os.execve(
+        sys.executable,
+        [sys.executable, *sys.orig_argv[1:]],
+        {**os.environ, "LD_PRELOAD": str(library)},
+    )
 
 
 def _faults() -> ctypes.CDLL | None:
@@ -150,8 +161,8 @@ def _faults() -> ctypes.CDLL | None:
 
 
 class Case:
-    """A folder with an input and an old result of one format, and what the new one is to be, after so many steps.
-    ``command``: what makes it."""
+    """A folder with an input and an old result of one format, and what the new one is to be, after
+    so many steps. ``command``: what makes it."""
 
     def __init__(self, folder: Path, suffix: str, steps: int) -> None:
         self.suffix, self.folder = suffix, folder
@@ -190,10 +201,12 @@ class Case:
         return {name: p.read_bytes() for name, p in sorted(named.items()) if name.startswith("low")}
 
     def faults_in(self, *, interrupted: bool = False) -> list[str]:
-        """What is wrong with the files there: nothing may be of another version than the root file, or changed.
-        ``interrupted``: may the result be one of fewer steps, which is only read?"""
+        """What is wrong with the files there: nothing may be of another version than the root file,
+        or changed. ``interrupted``: may the result be one of fewer steps, which is only read?"""
         found, root = self.results(), f"low{self.suffix}"
-        out = [] if (self.folder / "in.glb").read_bytes() == self.input else ["the input was changed"]
+        out = (
+            [] if (self.folder / "in.glb").read_bytes() == self.input else ["the input was changed"]
+        )
         if root not in found:
             return out
         expected = self.old if found[root] == self.old[root] else self.new
@@ -207,7 +220,9 @@ class Case:
     def left_over(self) -> list[str]:
         """Temporary files."""
         state = list((self.folder / "state").glob(".*")) if (self.folder / "state").exists() else []
-        return [p.name for p in (*self.folder.glob(PREFIX + "*"), *self.folder.glob(".low*"), *state)]
+        return [
+            p.name for p in (*self.folder.glob(PREFIX + "*"), *self.folder.glob(".low*"), *state)
+        ]
 
 
 def psnr_lost(case: Case, ended: Ended) -> float:

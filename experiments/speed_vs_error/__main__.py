@@ -1,13 +1,15 @@
-"""Speed against error: every lever of a fit on its own, and whole jobs, PSNR and FLIP against wall-clock time.
+"""Speed against error: every lever of a fit on its own, and whole jobs, PSNR and FLIP against
+wall-clock time.
 
     python -m experiments.speed_vs_error [--scenes ...] [--levers ...] [--seconds 12] [--jobs ...]
     python -m experiments.speed_vs_error --levers reference --seconds 50 --jobs none --scenes "chess_king"
     python -m experiments.speed_vs_error --write-docs
 
-Rows are appended to out/speed_vs_error/curves.csv (one fit of ``--seconds``, measured at several times) and jobs.csv
-(one command as a user runs it); those that are there are not run again. ``--write-docs`` measures nothing: it draws
-the pictures and puts tables and numbers into docs/. Scenes other than the embedded one need the folder
-``../shared/judge/references``, and are left out without it.
+Rows are appended to out/speed_vs_error/curves.csv (one fit of ``--seconds``, measured at several
+times) and jobs.csv (one command as a user runs it); those that are there are not run again.
+``--write-docs`` measures nothing: it draws the pictures and puts tables and numbers into docs/.
+Scenes other than the embedded one need the folder ``../shared/judge/references``, and are left out
+without it.
 """
 
 from __future__ import annotations
@@ -24,7 +26,15 @@ from experiments.common import ROOT, Missing
 from experiments.speed_vs_error import plots, tables
 from experiments.speed_vs_error.results import CurveRow, JobRow, read, scores, write
 from experiments.speed_vs_error.runner import Point, run
-from experiments.speed_vs_error.setups import DEFAULT, GROUPS, LEVERS, UNAVERAGED, Lever, Setup, default_setup
+from experiments.speed_vs_error.setups import (
+    DEFAULT,
+    GROUPS,
+    LEVERS,
+    UNAVERAGED,
+    Lever,
+    Setup,
+    default_setup,
+)
 from experiments.speed_vs_error.subjects import OUT, SUBJECTS, Bench, Subject
 from experiments.speed_vs_error.whole_jobs import JOBS, run_job
 
@@ -40,7 +50,9 @@ def main() -> None:
         write_docs(a.seconds)
         return
     # told of every fit that is stopped to be gone on with at another resolution
-    logging.getLogger("appearance_opt.fit.loop").addFilter(lambda record: "interrupted" not in record.msg)
+    logging.getLogger("appearance_opt.fit.loop").addFilter(
+        lambda record: "interrupted" not in record.msg
+    )
     subjects, levers = [s for s in _chosen(SUBJECTS, a.scenes) if _is_there(s)], _levers(a.levers)
     for subject in subjects:
         run_levers(subject, levers, a.seconds)
@@ -49,12 +61,24 @@ def main() -> None:
 
 
 def _arguments() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--scenes", default="", help=f"some of: {'; '.join(s.name for s in SUBJECTS)} (separated by ;)")
-    parser.add_argument("--levers", default="core", help="core, reference, all, none, or names separated by ;")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--scenes",
+        default="",
+        help=f"some of: {'; '.join(s.name for s in SUBJECTS)} (separated by ;)",
+    )
+    parser.add_argument(
+        "--levers", default="core", help="core, reference, all, none, or names separated by ;"
+    )
     parser.add_argument("--seconds", type=float, default=12.0, help="length of each fit [12]")
-    parser.add_argument("--jobs", default="all", help="all, none, or names of whole jobs separated by ;")
-    parser.add_argument("--write-docs", action="store_true", help="pictures and tables into docs/, no measuring")
+    parser.add_argument(
+        "--jobs", default="all", help="all, none, or names of whole jobs separated by ;"
+    )
+    parser.add_argument(
+        "--write-docs", action="store_true", help="pictures and tables into docs/, no measuring"
+    )
     return parser.parse_args()
 
 
@@ -66,7 +90,9 @@ def _chosen(subjects: tuple[Subject, ...], text: str) -> list[Subject]:
     wanted = _names(text)
     unknown = set(wanted) - {s.name for s in subjects}
     if unknown:
-        sys.exit(f"--scenes {text}: no scene '{unknown.pop()}'; there are {'; '.join(s.name for s in subjects)}")
+        sys.exit(
+            f"--scenes {text}: no scene '{unknown.pop()}'; there are {'; '.join(s.name for s in subjects)}"
+        )
     return [s for s in subjects if not wanted or s.name in wanted]
 
 
@@ -78,7 +104,9 @@ def _levers(text: str) -> list[Lever]:
     wanted = _names(text)
     unknown = set(wanted) - {lever.name for lever in LEVERS}
     if unknown:
-        sys.exit(f"--levers {text}: no lever '{unknown.pop()}'; there are {'; '.join(lever.name for lever in LEVERS)}")
+        sys.exit(
+            f"--levers {text}: no lever '{unknown.pop()}'; there are {'; '.join(lever.name for lever in LEVERS)}"
+        )
     return [lever for lever in LEVERS if lever.name in wanted]
 
 
@@ -114,7 +142,11 @@ def run_levers(subject: Subject, levers: list[Lever], seconds: float) -> None:
         fits = [r for r in rows if r.budget == seconds]
         end = tables.curve(fits, subject.name, lever.name)[-1]
         found = tables.against_default(fits, subject.name, lever.name)
-        against = "" if found is None else f", {found[0]:+.2f} dB, FLIP x {found[1]:.3f} against the default"
+        against = (
+            ""
+            if found is None
+            else f", {found[0]:+.2f} dB, FLIP x {found[1]:.3f} against the default"
+        )
         print(
             f"  [{time.perf_counter() - began:4.0f} s] {lever.name}: {end.step} steps, {end.psnr_covered:.2f} dB"
             f"{against}",
@@ -131,12 +163,18 @@ def run_jobs(subject: Subject, names: str) -> None:
     if not todo:
         return
     bench = _bench(subject)
-    print(f"{subject.name}: {len(todo)} whole jobs, {sum(j.seconds for j in todo):.0f} s and more", flush=True)
+    print(
+        f"{subject.name}: {len(todo)} whole jobs, {sum(j.seconds for j in todo):.0f} s and more",
+        flush=True,
+    )
     for job in todo:
         rows.append(run_job(bench, job))
         write(WHOLE, rows, JobRow)
         last = rows[-1]
-        print(f"  {job.name}: {last.seconds:.1f} s, {last.psnr_covered:.2f} dB, FLIP {last.flip:.4f}", flush=True)
+        print(
+            f"  {job.name}: {last.seconds:.1f} s, {last.psnr_covered:.2f} dB, FLIP {last.flip:.4f}",
+            flush=True,
+        )
 
 
 def _bench(subject: Subject) -> Bench:
@@ -152,7 +190,15 @@ def run_lever(bench: Bench, lever: Lever, setup: Setup, seconds: float) -> list[
 
     def rows(name: str, points: list[Point]) -> list[CurveRow]:
         return [
-            CurveRow(bench.subject.name, lever.group, name, seconds, round(p.seconds, 3), p.step, **scores(p.metrics))
+            CurveRow(
+                bench.subject.name,
+                lever.group,
+                name,
+                seconds,
+                round(p.seconds, 3),
+                p.step,
+                **scores(p.metrics),
+            )
             for p in points
         ]
 
@@ -172,9 +218,14 @@ def write_docs(seconds: float) -> None:
     every = [r for r in read(CURVES, CurveRow) if r.lever in place and r.scene in order]
     every.sort(key=lambda r: (order[r.scene], place[r.lever], r.seconds))
     curves, long = ([r for r in every if r.budget == s] for s in (seconds, LONG))
-    jobs = sorted((r for r in read(WHOLE, JobRow) if r.scene in order), key=lambda r: (order[r.scene], r.seconds))
+    jobs = sorted(
+        (r for r in read(WHOLE, JobRow) if r.scene in order),
+        key=lambda r: (order[r.scene], r.seconds),
+    )
     if not any(r.lever == DEFAULT for r in curves):
-        sys.exit(f"no fit of {seconds:g} s with default settings in {CURVES}: run the experiment first")
+        sys.exit(
+            f"no fit of {seconds:g} s with default settings in {CURVES}: run the experiment first"
+        )
     machine = f"{os.cpu_count()} cores of an {_processor()}, LLVM {backend.select('cpu').llvm}; fits of {seconds:g} s."
     sections = {"machine": f"Machine: {machine}", "levers": "", "jobs": ""}
     IMAGES.mkdir(parents=True, exist_ok=True)
@@ -192,7 +243,10 @@ def write_docs(seconds: float) -> None:
 
 def _section(pictures: dict[str, Path], table: str) -> str:
     """The first picture, the table, the other pictures."""
-    images = [f"![{title}]({path.relative_to(DOCUMENT.parent).as_posix()})" for title, path in pictures.items()]
+    images = [
+        f"![{title}]({path.relative_to(DOCUMENT.parent).as_posix()})"
+        for title, path in pictures.items()
+    ]
     return "\n\n".join([images[0], table, *images[1:]])
 
 

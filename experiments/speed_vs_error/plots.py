@@ -70,10 +70,20 @@ def _panel(axis, rows: list[CurveRow], scene: str, levers: list[str]) -> None:
             continue
         x, y = [r.seconds for r in own], [r.psnr_covered for r in own]
         values += y
-        axis.plot(x, y, color=colour, label=lever, marker="o", markersize=2.5, linewidth=1.8 if lever == DEFAULT else 1)
+        axis.plot(
+            x,
+            y,
+            color=colour,
+            label=lever,
+            marker="o",
+            markersize=2.5,
+            linewidth=1.8 if lever == DEFAULT else 1,
+        )
     if values:
         for first in curve(rows, scene, DEFAULT)[:1]:
-            axis.axhline(first.psnr_covered, color="black", linewidth=0.8, linestyle=":", label="start")
+            axis.axhline(
+                first.psnr_covered, color="black", linewidth=0.8, linestyle=":", label="start"
+            )
         # a lever that fails by many dB must not flatten all others
         low = max(min(values), np.percentile(values, 75) - 8.0)
         axis.set_ylim(low - 0.3, max(values) + 0.3)
@@ -83,13 +93,16 @@ def _panel(axis, rows: list[CurveRow], scene: str, levers: list[str]) -> None:
 
 
 def _levers(rows: list[CurveRow], path: Path) -> None:
-    """dB and FLIP ratio against the default after equal time: a line per lever, a colour per scene."""
+    """dB and FLIP ratio against the default after equal time: a line per lever, a colour per
+    scene."""
     import matplotlib.pyplot as plt
 
     scenes = scenes_of(rows)
     names = [n for levers in levers_of(rows).values() for n in levers if n != DEFAULT]
     figure, axes = plt.subplots(1, 2, figsize=(10.5, 0.28 * len(names) + 1.2), sharey=True)
-    for scene, colour, shift in zip(scenes, COLOURS, np.linspace(-0.24, 0.24, max(len(scenes), 2)), strict=False):
+    for scene, colour, shift in zip(
+        scenes, COLOURS, np.linspace(-0.24, 0.24, max(len(scenes), 2)), strict=False
+    ):
         found = [(k, against_default(rows, scene, n)) for k, n in enumerate(names)]
         kept = [(k, *pair) for k, pair in found if pair is not None]
         if not kept:
@@ -100,7 +113,9 @@ def _levers(rows: list[CurveRow], path: Path) -> None:
     axes[0].set_xlim(-LARGEST - 0.1, None)
     chance = [abs(f[0]) for f in (against_default(rows, s, SEED) for s in scenes) if f is not None]
     if chance:
-        axes[0].axvspan(-float(np.median(chance)), float(np.median(chance)), color="#eeeeee", zorder=0)
+        axes[0].axvspan(
+            -float(np.median(chance)), float(np.median(chance)), color="#eeeeee", zorder=0
+        )
     for axis, zero in zip(axes, (0.0, 1.0), strict=True):
         axis.axvline(zero, color="black", linewidth=0.8)
         axis.grid(alpha=0.25, linewidth=0.4)
@@ -118,12 +133,14 @@ LARGEST = 2.0
 
 
 def _jobs(rows: list[JobRow], path: Path) -> None:
-    """PSNR and FLIP against wall time of whole jobs: a column per scene, a line per preset, a star at its own
-    budget; the Pareto front in grey."""
+    """PSNR and FLIP against wall time of whole jobs: a column per scene, a line per preset, a star
+    at its own budget; the Pareto front in grey."""
     import matplotlib.pyplot as plt
 
     scenes = scenes_of(rows)
-    figure, axes = plt.subplots(2, len(scenes), figsize=(4.6 * len(scenes), 6.4), squeeze=False, sharex="col")
+    figure, axes = plt.subplots(
+        2, len(scenes), figsize=(4.6 * len(scenes), 6.4), squeeze=False, sharex="col"
+    )
     for column, scene in zip(axes.T, scenes, strict=True):
         own = sorted((r for r in rows if r.scene == scene), key=lambda r: r.seconds)
         front = pareto(own)
@@ -137,13 +154,19 @@ def _jobs(rows: list[JobRow], path: Path) -> None:
                 axis.plot(x, y, color=colour, marker="o", markersize=4, linewidth=1, label=preset)
                 star = [r for r in line if r.job == preset]
                 axis.scatter(
-                    [r.seconds for r in star], [getattr(r, name) for r in star], s=150, marker="*", color=colour
+                    [r.seconds for r in star],
+                    [getattr(r, name) for r in star],
+                    s=150,
+                    marker="*",
+                    color=colour,
                 )
             _seconds_axis(axis)
             axis.grid(alpha=0.25, linewidth=0.4)
         column[0].set_title(scene, fontsize=9)
         column[0].legend(fontsize=7, loc="lower right")
-        column[1].set_xlabel("seconds from the command to its end (star: the preset's own budget)", fontsize=7)
+        column[1].set_xlabel(
+            "seconds from the command to its end (star: the preset's own budget)", fontsize=7
+        )
     axes[0, 0].set_ylabel("PSNR, covered (dB)", fontsize=8)
     axes[1, 0].set_ylabel("FLIP", fontsize=8)
     _save(figure, path)

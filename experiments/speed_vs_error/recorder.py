@@ -1,4 +1,5 @@
-"""Looks at a running fit that cost it nothing: states are remembered, and measured when the fit is over."""
+"""Looks at a running fit that cost it nothing: states are remembered, and measured when the fit is
+over."""
 
 from __future__ import annotations
 
@@ -26,9 +27,10 @@ class Snapshot:
 
 
 class Recorder:
-    """Stands where the loop expects a ``Checkpointer``, and keeps snapshots in memory at given ``times`` (seconds).
-    Arrays are never changed in place, so a snapshot copies nothing. ``stop``: seconds after which the fit is ended
-    as if by Ctrl-C, to be gone on with by another fit with the same recorder (at another resolution)."""
+    """Stands where the loop expects a ``Checkpointer``, and keeps snapshots in memory at given
+    ``times`` (seconds). Arrays are never changed in place, so a snapshot copies nothing. ``stop``:
+    seconds after which the fit is ended as if by Ctrl-C, to be gone on with by another fit with the
+    same recorder (at another resolution)."""
 
     def __init__(self, times: Sequence[float]) -> None:
         self.snapshots: list[Snapshot] = []
@@ -39,7 +41,8 @@ class Recorder:
         self._stopped = False
 
     def restore(self, model: Model, state: FitState) -> bool:
-        """Called before the clock of a fit starts: go on where the last one was stopped, if there was one."""
+        """Called before the clock of a fit starts: go on where the last one was stopped, if there
+        was one."""
         self._began = time.perf_counter()
         if self._kept is None:
             return False
@@ -54,7 +57,9 @@ class Recorder:
     def due(self) -> bool:
         """Is it time for a snapshot?"""
         now = time.perf_counter() - self._began
-        return (self.stop is not None and now >= self.stop) or bool(self._times and now >= self._times[0])
+        return (self.stop is not None and now >= self.stop) or bool(
+            self._times and now >= self._times[0]
+        )
 
     def save(self, model: Model, state: FitState) -> None:
         """Remember the state. Raises KeyboardInterrupt when the fit is to be stopped here."""
@@ -69,8 +74,8 @@ class Recorder:
 
 
 class Blind:
-    """Stands where the loop expects a ``Validation``: the loop's own looks would cost time here, and are not
-    needed."""
+    """Stands where the loop expects a ``Validation``: the loop's own looks would cost time here,
+    and are not needed."""
 
     def psnr(self, model: Model) -> float:
         """No opinion."""

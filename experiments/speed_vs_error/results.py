@@ -1,4 +1,5 @@
-"""Rows on disk: one line per point of a curve, and one per whole job. A row that is there is not measured again."""
+"""Rows on disk: one line per point of a curve, and one per whole job. A row that is there is not
+measured again."""
 
 from __future__ import annotations
 
@@ -15,8 +16,8 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class CurveRow:
-    """A fit of ``budget`` seconds after ``seconds``: covered and whole PSNR in dB, mean FLIP, silhouette shift in
-    pixels, over the held-out views."""
+    """A fit of ``budget`` seconds after ``seconds``: covered and whole PSNR in dB, mean FLIP,
+    silhouette shift in pixels, over the held-out views."""
 
     scene: str
     group: str
@@ -60,7 +61,10 @@ def read(path: Path, kind: type[Row]) -> list[Row]:
         return []
     convert = {"str": str, "float": float, "int": int}
     with path.open(newline="", encoding="utf-8") as file:
-        return [kind(**{f.name: convert[str(f.type)](r[f.name]) for f in fields(kind)}) for r in csv.DictReader(file)]
+        return [
+            kind(**{f.name: convert[str(f.type)](r[f.name]) for f in fields(kind)})
+            for r in csv.DictReader(file)
+        ]
 
 
 def write(path: Path, rows: Iterable[Row], kind: type[Row]) -> None:

@@ -51,7 +51,11 @@ class Point:
 def run(bench: Bench, setup: Setup, seconds: float) -> Run:
     """Fit for ``seconds``, set-up, warm-up and measuring not counted."""
     start = bench.start(setup.texture)
-    maps = start.maps if setup.closed_form else {n: np.full_like(start.maps[n], CONSTANT[n]) for n in start.maps}
+    maps = (
+        start.maps
+        if setup.closed_form
+        else {n: np.full_like(start.maps[n], CONSTANT[n]) for n in start.maps}
+    )
     start = replace(start, maps=maps)
     setup = replace(setup, rates=setup.rates or _rates(bench, start))
     with ExitStack() as patches:
@@ -59,8 +63,12 @@ def run(bench: Bench, setup: Setup, seconds: float) -> Run:
         if not setup.mip:
             patches.enter_context(mock.patch("appearance_opt.latent.texels.MAX_LEVELS", 1))
         if not setup.laplacian_decays:
-            patches.enter_context(mock.patch("appearance_opt.fit.loop.laplacian_weight", lambda first, _: first))
-        return Run(bench, start, _timed(bench, start, setup, seconds), (setup.texture, setup.closed_form))
+            patches.enter_context(
+                mock.patch("appearance_opt.fit.loop.laplacian_weight", lambda first, _: first)
+            )
+        return Run(
+            bench, start, _timed(bench, start, setup, seconds), (setup.texture, setup.closed_form)
+        )
 
 
 @dataclass(frozen=True)
@@ -73,7 +81,8 @@ class Run:
     which: tuple[int, bool]
 
     def measured(self, averaged: bool = True) -> list[Point]:
-        """The start and every snapshot: the running means of the parameters, or their last values."""
+        """The start and every snapshot: the running means of the parameters, or their last
+        values."""
         model = Model(self.start.mesh, self.start.maps, PARTS, Rates())
         points = [Point(0.0, 0, self.bench.measure_start(self.which, model))]
         for s in self.snapshots:
@@ -89,7 +98,14 @@ def _timed(bench: Bench, start: Start, setup: Setup, seconds: float) -> list[Sna
     if setup.coarse is not None:
         phases.insert(0, (setup.coarse[0] * seconds, setup.coarse[1]))
     for stop, resolution in phases:
-        _fit(bench, start, replace(setup, pool=2 * setup.views), resolution, Recorder(()), steps=WARM_UP_STEPS)
+        _fit(
+            bench,
+            start,
+            replace(setup, pool=2 * setup.views),
+            resolution,
+            Recorder(()),
+            steps=WARM_UP_STEPS,
+        )
         recorder.stop = stop
         _fit(bench, start, setup, resolution, recorder, seconds=seconds)
     return recorder.snapshots
@@ -112,7 +128,14 @@ def _fit(
     sampler = replace(bench.sampler, seed=setup.seed)
     width = setup.width(resolution)
     pool = ReferencePool(
-        bench.reference, sampler, setup.pool, setup.views, resolution, setup.pool_samples, width, setup.reuse
+        bench.reference,
+        sampler,
+        setup.pool,
+        setup.views,
+        resolution,
+        setup.pool_samples,
+        width,
+        setup.reuse,
     )
     options = FitOptions(
         steps=steps, seconds=seconds, loss=setup.loss, laplacian=setup.laplacian, relative=setup.relative,

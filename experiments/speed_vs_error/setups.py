@@ -14,11 +14,12 @@ from appearance_opt.render.quality import Quality
 
 @dataclass(frozen=True)
 class Setup:
-    """Everything that a lever can move. ``point_width``: None follows the product's rule. ``rates``: None follows
-    the product's rule for the start. ``smoothing``: strength of preconditioned steps of the positions, with
-    ``smooth_rate`` in units of the object's radius; 0 for plain Adam. ``coarse``: until which part of the fit, at
-    which resolution, before ``resolution``. ``decimated``: as opposed to a sphere that is grown.
-    ``closed_form``: maps transferred from the reference rather than constant."""
+    """Everything that a lever can move. ``point_width``: None follows the product's rule.
+    ``rates``: None follows the product's rule for the start. ``smoothing``: strength of
+    preconditioned steps of the positions, with ``smooth_rate`` in units of the object's radius; 0
+    for plain Adam. ``coarse``: until which part of the fit, at which resolution, before
+    ``resolution``. ``decimated``: as opposed to a sphere that is grown. ``closed_form``: maps
+    transferred from the reference rather than constant."""
 
     resolution: int
     views: int
@@ -45,12 +46,16 @@ class Setup:
 
     def width(self, resolution: int) -> float:
         """Filter width of point samples, in pixels."""
-        return fitting.point_width(resolution, self.texture) if self.point_width is None else self.point_width
+        return (
+            fitting.point_width(resolution, self.texture)
+            if self.point_width is None
+            else self.point_width
+        )
 
 
 def default_setup(grown: bool, triangles: int) -> Setup:
-    """What the product does: the preset ``default`` from a decimated mesh, or the growing of a sphere of
-    ``triangles``."""
+    """What the product does: the preset ``default`` from a decimated mesh, or the growing of a
+    sphere of ``triangles``."""
     if grown:
         strength, rate = growth.smoothing(triangles)
         return Setup(
@@ -64,8 +69,8 @@ def default_setup(grown: bool, triangles: int) -> Setup:
 
 @dataclass(frozen=True)
 class Lever:
-    """One change. ``group``: the panel it is drawn in. ``change`` returns None where it means nothing. ``core``:
-    part of the published run; the others are there to be asked for by name."""
+    """One change. ``group``: the panel it is drawn in. ``change`` returns None where it means
+    nothing. ``core``: part of the published run; the others are there to be asked for by name."""
 
     name: str
     group: str
@@ -74,8 +79,8 @@ class Lever:
 
 
 DEFAULT, SEED, UNAVERAGED = "default", "another seed", "no averaging"
-"""The second tells what chance does. The third is no fit of its own: the last parameters of the default's fit rather
-than their running mean."""
+"""The second tells what chance does. The third is no fit of its own: the last parameters of the
+default's fit rather than their running mean."""
 
 
 def _resolution(factor: float) -> Callable[[Setup], Setup]:
@@ -120,7 +125,9 @@ def _absolute(s: Setup) -> Setup:
 
 def _large_steps(rate: float) -> Callable[[Setup], Setup | None]:
     # smoothing takes the regularizer's place, as in the paper and as in growing
-    return lambda s: replace(s, smoothing=1.0, smooth_rate=rate, laplacian=0.0) if s.decimated else None
+    return lambda s: (
+        replace(s, smoothing=1.0, smooth_rate=rate, laplacian=0.0) if s.decimated else None
+    )
 
 
 def _plain_adam(s: Setup) -> Setup | None:
@@ -139,7 +146,11 @@ LEVERS = (
     Lever("resolution x 1/2", "resolution", _resolution(0.5)),
     Lever("resolution x 3/4", "resolution", _resolution(0.75), core=False),
     Lever("resolution x 3/2", "resolution", _resolution(1.5)),
-    Lever("half resolution for 30 %", "resolution", lambda s: replace(s, coarse=(0.3, s.resolution // 2))),
+    Lever(
+        "half resolution for 30 %",
+        "resolution",
+        lambda s: replace(s, coarse=(0.3, s.resolution // 2)),
+    ),
     Lever("views x 1/2", "views per step", _views(0.5)),
     Lever("views x 2", "views per step", _views(2.0)),
     Lever("pool x 2/5", "views per step", lambda s: replace(s, pool=2 * s.pool // 5), core=False),
@@ -148,7 +159,9 @@ LEVERS = (
     Lever("views seen twice", "reference", _reuse(2), core=False),
     Lever("views seen once", "reference", _reuse(1), core=False),
     Lever("4 rays at its outlines", "reference", lambda s: replace(s, pool_samples=4), core=False),
-    Lever("32 rays at its outlines", "reference", lambda s: replace(s, pool_samples=32), core=False),
+    Lever(
+        "32 rays at its outlines", "reference", lambda s: replace(s, pool_samples=32), core=False
+    ),
     Lever("points 2/5 as wide", "reference", _wider(0.4), core=False),
     Lever("no silhouette gradient", "visibility", _quality(0.0, 1)),
     Lever("4 rays at silhouettes", "visibility", _quality(1.0, 4)),
@@ -184,5 +197,7 @@ LEVERS = (
     Lever("loss relative-l2", "loss", _loss("relative-l2"), core=False),
 )
 
-GROUPS = {DEFAULT: LEVERS[0].group, UNAVERAGED: LEVERS[0].group} | {lever.name: lever.group for lever in LEVERS}
+GROUPS = {DEFAULT: LEVERS[0].group, UNAVERAGED: LEVERS[0].group} | {
+    lever.name: lever.group for lever in LEVERS
+}
 """Lever -> group, in the order of tables and pictures."""

@@ -38,7 +38,8 @@ VIEWS, RESOLUTION, SAMPLES = 8, 256, 9
 
 @dataclass(frozen=True)
 class Subject:
-    """One asset and how it is simplified: ``ratio`` of its triangles, or ``triangles`` from a sphere."""
+    """One asset and how it is simplified: ``ratio`` of its triangles, or ``triangles`` from a
+    sphere."""
 
     name: str
     source: str
@@ -58,7 +59,8 @@ class Subject:
         return ["--ratio", str(self.ratio)]
 
     def path(self) -> Path:
-        """The file; the embedded scene is written when first asked for. Raises ``common.Missing``."""
+        """The file; the embedded scene is written when first asked for. Raises
+        ``common.Missing``."""
         return source_of(self.source)
 
 
@@ -89,10 +91,12 @@ class Bench:
         return self.reference.render(self._views, RESOLUTION, SAMPLES)
 
     def start(self, texture: int) -> Start:
-        """The start with an atlas of ``texture`` texels: a sphere with random maps as it is grown, or the decimated
-        mesh of the preset ``default`` with maps transferred in closed form."""
+        """The start with an atlas of ``texture`` texels: a sphere with random maps as it is grown,
+        or the decimated mesh of the preset ``default`` with maps transferred in closed form."""
         if texture not in self._starts:
-            self._starts[texture] = self._sphere(texture) if self.subject.grown else self._decimated(texture)
+            self._starts[texture] = (
+                self._sphere(texture) if self.subject.grown else self._decimated(texture)
+            )
         return self._starts[texture]
 
     def measure(self, model: Model) -> Metrics:
@@ -107,7 +111,9 @@ class Bench:
 
     def measure_asset(self, asset: Asset) -> Metrics:
         """The same for a result as it was written, in the units of the source."""
-        return compare_images(self.images, render_asset(self.placement.local(asset), self._views, RESOLUTION, SAMPLES))
+        return compare_images(
+            self.images, render_asset(self.placement.local(asset), self._views, RESOLUTION, SAMPLES)
+        )
 
     @cached_property
     def _camera(self):
@@ -118,7 +124,9 @@ class Bench:
     def _sphere(self, texture: int) -> Start:
         assert self.subject.triangles is not None
         mesh = growth.first_shape(self.subject.triangles, self.sampler, texture)
-        return Start(mesh, {**random_maps(texture, 0, True)}, False, np.zeros((texture, texture), bool))
+        return Start(
+            mesh, {**random_maps(texture, 0, True)}, False, np.zeros((texture, texture), bool)
+        )
 
     def _decimated(self, texture: int) -> Start:
         # a number of steps instead of a budget: a slow machine must not drop rounds of reallocation
@@ -130,11 +138,15 @@ class Bench:
                 count = budget(options, self.asset.triangle_count)
                 return make_start(self.reference, options, self.sampler, count), False
             mesh = self.start(first).mesh  # the same triangles in another atlas
-            other = simplify_options("default", ratio=self.subject.ratio, steps=0, texture_size=texture)
+            other = simplify_options(
+                "default", ratio=self.subject.ratio, steps=0, texture_size=texture
+            )
             atlas = unwrap(mesh.positions, mesh.faces, texture, gutter(len(mesh.faces), other))
             return transfer_appearance(self.reference, atlas, other), False
 
-        key = hashlib.sha256(json.dumps(as_dict(options), sort_keys=True).encode() + self._path.read_bytes())
+        key = hashlib.sha256(
+            json.dumps(as_dict(options), sort_keys=True).encode() + self._path.read_bytes()
+        )
         folder = OUT / "starts"
         folder.mkdir(parents=True, exist_ok=True)
         path = folder / f"{self._path.stem}_{texture}.npz"

@@ -13,7 +13,9 @@ if TYPE_CHECKING:
 
 def curve(rows: list[CurveRow], scene: str, lever: str) -> list[CurveRow]:
     """The points of one fit, in the order of time."""
-    return sorted((r for r in rows if (r.scene, r.lever) == (scene, lever)), key=lambda r: r.seconds)
+    return sorted(
+        (r for r in rows if (r.scene, r.lever) == (scene, lever)), key=lambda r: r.seconds
+    )
 
 
 def scenes_of(rows: list[CurveRow] | list[JobRow]) -> list[str]:
@@ -32,7 +34,8 @@ def levers_of(rows: list[CurveRow]) -> dict[str, list[str]]:
 
 
 def against_default(rows: list[CurveRow], scene: str, lever: str) -> tuple[float, float] | None:
-    """(dB above the default, FLIP over that of the default) at the end of both fits, or None without them."""
+    """(dB above the default, FLIP over that of the default) at the end of both fits, or None
+    without them."""
     own, base = curve(rows, scene, lever), curve(rows, scene, DEFAULT)
     if not own or not base:
         return None
@@ -40,19 +43,24 @@ def against_default(rows: list[CurveRow], scene: str, lever: str) -> tuple[float
 
 
 def lever_table(rows: list[CurveRow]) -> str:
-    """One line per lever, one column per scene: dB and FLIP ratio against the default after the same time, and
-    steps."""
+    """One line per lever, one column per scene: dB and FLIP ratio against the default after the
+    same time, and steps."""
     scenes = scenes_of(rows)
     lines = ["| lever | " + " | ".join(scenes) + " |", "|---" * (len(scenes) + 1) + "|"]
     ends = [curve(rows, s, DEFAULT) for s in scenes]
-    cells = [f"{e[-1].psnr_covered:.2f} dB / {e[-1].flip:.4f} ({e[-1].step} steps)" if e else "" for e in ends]
+    cells = [
+        f"{e[-1].psnr_covered:.2f} dB / {e[-1].flip:.4f} ({e[-1].step} steps)" if e else ""
+        for e in ends
+    ]
     lines.append("| **default, absolute** | " + " | ".join(cells) + " |")
     starts = [f"{e[0].psnr_covered:.2f} dB / {e[0].flip:.4f}" if e else "" for e in ends]
     lines.append("| *its start* | " + " | ".join(starts) + " |")
     for names in levers_of(rows).values():
         for lever in names:
             if lever != DEFAULT:
-                lines.append(f"| {lever} | " + " | ".join(_cell(rows, s, lever) for s in scenes) + " |")
+                lines.append(
+                    f"| {lever} | " + " | ".join(_cell(rows, s, lever) for s in scenes) + " |"
+                )
     return "\n".join(lines)
 
 
@@ -64,8 +72,9 @@ def _cell(rows: list[CurveRow], scene: str, lever: str) -> str:
 
 
 def pareto(rows: list[JobRow], slack: float = 0.02) -> set[str]:
-    """Jobs of one scene that none beats: no other is at least as good (within nothing) in no more time.
-    ``slack``: part of the time that counts as the same, which is how exactly a budget is kept."""
+    """Jobs of one scene that none beats: no other is at least as good (within nothing) in no more
+    time. ``slack``: part of the time that counts as the same, which is how exactly a budget is
+    kept."""
     front = set()
     for r in rows:
         faster = [o for o in rows if o is not r and o.seconds <= (1 + slack) * r.seconds]
@@ -93,7 +102,8 @@ def job_table(rows: list[JobRow]) -> str:
 
 
 def insert(document: Path, sections: dict[str, str]) -> None:
-    """Put Markdown between ``<!-- NAME -->`` and ``<!-- /NAME -->``. Raises ValueError where a mark is missing."""
+    """Put Markdown between ``<!-- NAME -->`` and ``<!-- /NAME -->``. Raises ValueError where a mark
+    is missing."""
     text = document.read_text(encoding="utf-8")
     for name, body in sections.items():
         begin, end = f"<!-- {name} -->", f"<!-- /{name} -->"

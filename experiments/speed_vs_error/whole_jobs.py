@@ -1,4 +1,5 @@
-"""Whole jobs as a user runs them: the command line, start of the program, set-up and report included."""
+"""Whole jobs as a user runs them: the command line, start of the program, set-up and report
+included."""
 
 from __future__ import annotations
 
@@ -20,7 +21,8 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Job:
-    """A preset with a ``budget`` in seconds: its own (None), another one, or 0 for its start without a fit."""
+    """A preset with a ``budget`` in seconds: its own (None), another one, or 0 for its start
+    without a fit."""
 
     preset: str
     budget: int | None = None
@@ -48,7 +50,14 @@ class Job:
 
 SHORT = (Job("draft", 0), Job("draft"), Job("default", 17), Job("default", 30))
 JOBS = {
-    "flight_helmet": (*SHORT, Job("draft", 65), Job("default"), Job("final", 65), Job("final"), Job("default", 280)),
+    "flight_helmet": (
+        *SHORT,
+        Job("draft", 65),
+        Job("default"),
+        Job("final", 65),
+        Job("final"),
+        Job("default", 280),
+    ),
     "demo scene": (*SHORT, Job("draft", 30), Job("default")),
 }
 """By scene. What could keep a preset from the Pareto front is another one with the same time."""
@@ -68,4 +77,6 @@ def run_job(bench: Bench, job: Job) -> JobRow:
     if done.returncode:
         raise RuntimeError(f"{' '.join(command)} failed:\n{done.stdout}{done.stderr}")
     metrics = bench.measure_asset(load(result))
-    return JobRow(bench.subject.name, job.name, job.preset, job.seconds, round(seconds, 2), **scores(metrics))
+    return JobRow(
+        bench.subject.name, job.name, job.preset, job.seconds, round(seconds, 2), **scores(metrics)
+    )

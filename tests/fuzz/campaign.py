@@ -22,8 +22,8 @@ MEMORY = 2 << 30
 
 @dataclass
 class Tally:
-    """``read``, ``refused``: counts of what may happen; ``faults``: what may not, by the number of the file;
-    ``slowest`` (seconds) and ``peak`` (bytes) of any file that ended."""
+    """``read``, ``refused``: counts of what may happen; ``faults``: what may not, by the number of
+    the file; ``slowest`` (seconds) and ``peak`` (bytes) of any file that ended."""
 
     kind: str
     read: int = 0
@@ -50,8 +50,8 @@ class Tally:
 
 
 def run(kind: str, count: int, first: int = 0) -> Tally:
-    """Read ``count`` damaged files of a format of ``seeds.SEEDS``, numbers ``first`` and up: which files they are
-    depends on their number alone."""
+    """Read ``count`` damaged files of a format of ``seeds.SEEDS``, numbers ``first`` and up: which
+    files they are depends on their number alone."""
     tally = Tally(kind)
     with tempfile.TemporaryDirectory(prefix="fuzz") as name:
         folder = Path(name)
@@ -66,7 +66,11 @@ def _run_worker(folder: Path, kind: str, first: int, last: int, tally: Tally) ->
     """Let a process read files until it dies, hangs or has done; the number of the next file."""
     command = [sys.executable, "-m", "tests.fuzz.worker", str(folder), kind, str(first), str(last)]
     with subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, cwd=Path(__file__).parents[2]
+        command,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+        cwd=Path(__file__).parents[2],
     ) as worker:
         lines: queue.Queue[str] = queue.Queue()
         assert worker.stdout is not None

@@ -1,4 +1,5 @@
-"""What is done to a file: cuts, changed bytes, moved blocks, hostile numbers, and structures turned inside out."""
+"""What is done to a file: cuts, changed bytes, moved blocks, hostile numbers, and structures turned
+inside out."""
 
 from __future__ import annotations
 
@@ -19,7 +20,19 @@ NUMBERS = (
 )  # fmt: skip
 """What numbers of text formats are replaced by."""
 
-WORDS = (b"", b"\x1b[31m", b"\xff\xfe", b"../../etc/passwd", b"/dev/zero", b"a" * 5000, b'"', b"'", b"\\", b"\0", b"]")
+WORDS = (
+    b"",
+    b"\x1b[31m",
+    b"\xff\xfe",
+    b"../../etc/passwd",
+    b"/dev/zero",
+    b"a" * 5000,
+    b'"',
+    b"'",
+    b"\\",
+    b"\0",
+    b"]",
+)
 
 VALUES: tuple[Any, ...] = (
     None, True, -1, 0, 1 << 40, 1e308, -0.5, float("nan"), "", "\ud800", "\x1b[31m", "../x.bin", "data:,", [], {},
@@ -64,7 +77,13 @@ def _splice(data: bytes, rng: random.Random) -> bytes:
     """A block taken out, doubled, or moved."""
     a, b, c = sorted(rng.randrange(len(data) + 1) for _ in range(3))
     block = data[a : min(b, a + 4096)]
-    return rng.choice((data[:a] + data[a + len(block) :], data[:b] + block + data[b:], data[:c] + block + data[c:]))
+    return rng.choice(
+        (
+            data[:a] + data[a + len(block) :],
+            data[:b] + block + data[b:],
+            data[:c] + block + data[c:],
+        )
+    )
 
 
 def _integer(data: bytes, rng: random.Random) -> bytes:
@@ -117,7 +136,12 @@ def _glb(data: bytes, rng: random.Random) -> bytes:
         return data
     text = json.dumps(_changed(document, rng)).encode()
     text += b" " * (-len(text) % 4)
-    body = struct.pack("<II", len(text), 0x4E4F534A) + text + struct.pack("<II", len(binary), 0x004E4942) + binary
+    body = (
+        struct.pack("<II", len(text), 0x4E4F534A)
+        + text
+        + struct.pack("<II", len(binary), 0x004E4942)
+        + binary
+    )
     return struct.pack("<4sII", b"glTF", 2, 12 + len(body)) + body
 
 
@@ -166,5 +190,7 @@ def _png(data: bytes, rng: random.Random) -> bytes:
     chunks[k] = kind, rng.choice((_flip, _integer, _cut))(body, rng) if body else b"\0"
     out = data[:8]
     for kind, body in chunks:
-        out += struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
+        out += (
+            struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
+        )
     return out

@@ -18,7 +18,8 @@ FINGERPRINT = "the job of the seeds"
 
 @dataclass(frozen=True)
 class Seed:
-    """``file`` is damaged, ``root`` is read (the same, or what refers to it); ``reader`` of ``worker.READERS``."""
+    """``file`` is damaged, ``root`` is read (the same, or what refers to it); ``reader`` of
+    ``worker.READERS``."""
 
     file: str
     root: str
@@ -121,10 +122,14 @@ def write_seeds(folder: Path) -> None:
     pixels = (np.random.default_rng(0).random((24, 17, 3)) * 255).astype(np.uint8)
     for suffix, kind in (("png", oiio.UINT8), ("jpg", oiio.UINT8), ("exr", oiio.HALF)):
         out = oiio.ImageOutput.create(f"x.{suffix}")
-        assert out.open(str(folder / f"x.{suffix}"), oiio.ImageSpec(17, 24, 3, kind)) and out.write_image(pixels)
+        assert out.open(
+            str(folder / f"x.{suffix}"), oiio.ImageSpec(17, 24, 3, kind)
+        ) and out.write_image(pixels)
         out.close()
     rows = {k: np.arange(40, dtype=np.float32) for k in ("positions", "texels")}
-    archive.write(folder / "x.npz", FINGERPRINT, {"values": rows, "curve": [(0.5, 1)], "seconds": 1.5})
+    archive.write(
+        folder / "x.npz", FINGERPRINT, {"values": rows, "curve": [(0.5, 1)], "seconds": 1.5}
+    )
 
 
 def glb_parts(data: bytes) -> tuple[dict, bytes]:

@@ -19,7 +19,9 @@ SLOW = {"USDA", "USDC", "USDZ", "MaterialX"}
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", SEEDS)
 def test_damaged_files_are_read_or_refused(kind: str) -> None:
-    pytest.importorskip("DracoPy" if kind == "Draco" else "meshopt" if kind == "meshopt" else "numpy")
+    pytest.importorskip(
+        "DracoPy" if kind == "Draco" else "meshopt" if kind == "meshopt" else "numpy"
+    )
     tally = run(kind, 60 if kind in SLOW else 300)
     assert not tally.faults
     assert tally.refused  # and the damage is seen

@@ -1,7 +1,8 @@
-"""Reads damaged files, one after the other: ``python -m tests.fuzz.worker FOLDER FORMAT FIRST LAST``.
+"""Reads damaged files, one after the other: ``python -m tests.fuzz.worker FOLDER FORMAT FIRST
+LAST``.
 
-Prints a line of JSON when it begins with a file and one when it has done: the number of the file, and how it ended
-("read", "refused", or the exception that no reader may raise).
+Prints a line of JSON when it begins with a file and one when it has done: the number of the file,
+and how it ended ("read", "refused", or the exception that no reader may raise).
 """
 
 from __future__ import annotations
@@ -49,7 +50,12 @@ def read_checkpoint(path: Path) -> None:
         raise InputError(f"{path}: {error}") from error
 
 
-READERS = {"asset": read_asset, "picture": read_picture, "job": read_job, "checkpoint": read_checkpoint}
+READERS = {
+    "asset": read_asset,
+    "picture": read_picture,
+    "job": read_job,
+    "checkpoint": read_checkpoint,
+}
 
 
 def outcome(reader: str, path: Path) -> str:
@@ -58,7 +64,11 @@ def outcome(reader: str, path: Path) -> str:
         READERS[reader](path)
     except InputError as error:
         text = str(error)
-        return "refused" if text.isprintable() and len(text) < LONGEST else f"no line to show: {text!r}"
+        return (
+            "refused"
+            if text.isprintable() and len(text) < LONGEST
+            else f"no line to show: {text!r}"
+        )
     except Exception as error:
         where = traceback.extract_tb(error.__traceback__)[-1]
         return f"{type(error).__name__}: {str(error)[:200]} at {Path(where.filename).name}:{where.lineno}"
