@@ -13,7 +13,7 @@ import numpy as np
 
 from appearance_opt.asset import basis
 from appearance_opt.asset.paths import read_bytes
-from appearance_opt.errors import InputError, one_line
+from appearance_opt.errors import InputError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -182,14 +182,11 @@ def _encode(
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / ("image" + suffix)
         out = oiio.ImageOutput.create(str(path))
+        fault, full = f"a {suffix} image could not be encoded in {folder}", "is its disk full?"
         if out is None or not out.open(str(path), spec) or not out.write_image(pixels):
-            raise OSError(
-                f"a {suffix} image could not be encoded in {folder} ({one_line(oiio.geterror())})"
-            )
+            raise OSError(f"{fault} ({_reason(oiio.geterror, full)})")
         if not out.close():  # what is buffered meets a full disk only now
-            raise OSError(
-                f"a {suffix} image could not be encoded in {folder} ({one_line(out.geterror())})"
-            )
+            raise OSError(f"{fault} ({_reason(out.geterror, full)})")
         return path.read_bytes()
 
 
