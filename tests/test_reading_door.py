@@ -70,7 +70,14 @@ class _Raising:
 
 
 @pytest.mark.parametrize(
-    "fault", [NameError("pixls"), AssertionError(), NotImplementedError(), ImportError("x")]
+    "fault",
+    [
+        NameError("pixls"),
+        AssertionError(),
+        NotImplementedError(),
+        ImportError("x"),
+        AttributeError("module has no function of that name", obj=json),
+    ],
 )
 def test_planted_bugs_stay_visible(
     fault: Exception, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

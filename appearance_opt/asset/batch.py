@@ -61,9 +61,8 @@ class Batch:
     @cached_property
     def faces(self) -> NDArray[np.integer]:
         """(F, 3) corners by their number among all vertices, in 32 bits if these do."""
-        first = self.first_vertex.astype(
-            np.int64 if self.vertex_counts.sum() >= 2**31 else np.int32
-        )
+        kind: type[np.integer] = np.int64 if self.vertex_counts.sum() >= 2**31 else np.int32
+        first: NDArray[np.integer] = self.first_vertex.astype(kind)
         return self.own_faces + first[self.mesh_of_face][:, None]
 
     def have(self, name: str) -> NDArray[np.bool_]:
@@ -115,7 +114,8 @@ class Batch:
 
 def in_range(mesh: Mesh) -> bool:
     """Do all its corners exist? (If not, ``repair`` refuses it, and counts them.)"""
-    return not len(mesh.faces) or (mesh.faces.min() >= 0 and mesh.faces.max() < len(mesh.positions))
+    faces = mesh.faces
+    return not len(faces) or bool(faces.min() >= 0 and faces.max() < len(mesh.positions))
 
 
 def fill_normals(meshes: Sequence[Mesh]) -> list[Mesh]:

@@ -10,6 +10,7 @@ import zlib
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from types import ModuleType
 from typing import TYPE_CHECKING
 
 from appearance_opt.asset.paths import without_stray_bytes
@@ -53,6 +54,8 @@ def reading(path: Path) -> Iterator[None]:
     except OUR_FAULTS:
         raise
     except DATA_FAULTS as error:
+        if isinstance(getattr(error, "obj", None), ModuleType):
+            raise  # a package lacks a function: it has another version than we ask for
         raise InputError(
             f"{path}: its structure is broken "
             f"({type(error).__name__}: {str(error)[:120]}; found in {_place(error)}); export it again"

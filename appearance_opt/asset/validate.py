@@ -254,7 +254,8 @@ def _repair(mesh: Mesh, source: str, notes: Notes) -> Mesh:
             notes(
                 f"mesh '{mesh.name}': {int(lost[used].sum())} {what} that are no numbers set to {value:g}"
             )
-        mesh = replace(mesh, **{name: np.where(lost[:, None], np.float32(value), given)})
+        mended = np.where(lost[:, None], np.float32(value), given)
+        mesh = replace(mesh, **{name: mended})  # type: ignore[arg-type]
     degenerate = _degenerate(mesh.positions, mesh.faces)
     if degenerate.any():
         notes(f"mesh '{mesh.name}': {int(degenerate.sum())} degenerate faces dropped")

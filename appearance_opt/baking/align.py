@@ -34,7 +34,7 @@ def align(moving: Asset, still: Asset) -> tuple[Asset, float, NDArray[np.float64
     moving_origin = np.array(moving.origin) - origin
     # near the still one, where numbers are small
     (a0, a1), (b0, b1) = (np.array(asset.bounds()) - origin for asset in (moving, still))
-    scale = float(np.linalg.norm(b1 - b0) / max(np.linalg.norm(a1 - a0), 1e-300))
+    scale = float(np.linalg.norm(b1 - b0)) / max(float(np.linalg.norm(a1 - a0)), 1e-300)
     shift = (b0 + b1) / 2 - scale * (a0 + a1) / 2
     size = float(np.linalg.norm(b1 - b0))
     target, _ = _surface_points(still, POINTS, 1)

@@ -81,7 +81,7 @@ class BakedMaps:
     @property
     def missed_share(self) -> float:
         """Fraction of the covered texels whose rays found nothing."""
-        return float(self.missed.sum() / max(self.covered.sum(), 1))
+        return float(self.missed.sum() / max(int(self.covered.sum()), 1))
 
 
 def bake(reference: MeshReference, mesh: LatentMesh, settings: Settings) -> BakedMaps:
@@ -109,7 +109,8 @@ def bake(reference: MeshReference, mesh: LatentMesh, settings: Settings) -> Bake
         own = values[..., start : start + len(channels)]
         start += len(channels)
         if field in ("normal", "object-normal"):
-            own = own / np.maximum(np.linalg.norm(own, axis=-1, keepdims=True), 1e-6)
+            length = np.linalg.norm(own, axis=-1, keepdims=True)
+            own = (own / np.maximum(length, 1e-6)).astype(np.float32)
         filled = fill(own, found)
         maps.update({c: np.ascontiguousarray(filled[..., k]) for k, c in enumerate(channels)})
     return BakedMaps(maps, covered, covered & ~found & ~hidden, hidden, reach)

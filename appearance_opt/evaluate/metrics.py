@@ -73,7 +73,7 @@ def _view(reference: NDArray, candidate: NDArray) -> ViewMetrics:
         psnr=_psnr(float(error.mean())),
         psnr_covered=_psnr(float(error[covered].mean()) if covered.any() else 0.0),
         flip=float(flip),
-        silhouette_iou=float((inside & other).sum() / max((inside | other).sum(), 1)),
+        silhouette_iou=float((inside & other).sum() / max(int((inside | other).sum()), 1)),
         silhouette_shift=float(
             np.abs(reference[..., 3] - candidate[..., 3]).sum() / max(outline, 1)
         ),

@@ -60,7 +60,7 @@ class BakeResult:
     @property
     def missed_share(self) -> float:
         """Fraction of the covered texels whose rays found nothing."""
-        return float(self.missed.sum() / max(self.covered.sum(), 1))
+        return float(self.missed.sum() / max(int(self.covered.sum()), 1))
 
 
 def bake(

@@ -305,7 +305,7 @@ def transfer_appearance(
     result = transfer(
         reference, mesh if finest is None else finest, options.texture_size, not options.keep_hidden
     )
-    missed = result.missed.sum() / max(result.covered.sum(), 1)
+    missed = result.missed.sum() / max(int(result.covered.sum()), 1)
     if missed > 0.01:
         log.warning(
             "the transfer found no reference point for %.1f %% of the texels; they were filled",

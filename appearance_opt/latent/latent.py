@@ -159,7 +159,7 @@ def local_edge_length(positions: NDArray, faces: NDArray) -> NDArray[np.float32]
     mean for vertices without one."""
     length, count = edges_around(positions, faces)
     used = count > 0
-    mean = length[used].sum() / max(count[used].sum(), 1)
+    mean = length[used].sum() / max(int(count[used].sum()), 1)
     # divisors elsewhere: corners that all lie at one place still get a length
     floor = max(1e-6 * mean, 1e-12)
     return np.maximum(np.where(used, length / np.maximum(count, 1), mean), floor).astype(np.float32)
