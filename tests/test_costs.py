@@ -337,3 +337,12 @@ def test_warnings_of_usd_that_differ_in_names_are_counted(tmp_path: Path) -> Non
     (tmp_path / "x.usda").write_text("#usda 1.0\n" + mesh + parts)
     told = [note for note in load(tmp_path / "x.usda").notes if "gone" in note or "more" in note]
     assert len(told) == LINES + 1 and told[-1].startswith("... and 22 more: ")
+
+
+def test_materials_that_are_not_defined_are_counted(tmp_path: Path) -> None:
+    faces = "".join(f"usemtl m{k}\nf 1 2 3\n" for k in range(50))
+    (tmp_path / "x.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\n" + faces)
+    about = [n for n in load(tmp_path / "x.obj").notes if "defined" in n]
+    assert about == [
+        "materials 'm0', 'm1', 'm2' and 47 more: not defined, the default material is used"
+    ]

@@ -134,7 +134,9 @@ class _Parser:
                 self.companions.note(f"faces refer to {what}, of which there are none: ignored")
         for name in dict.fromkeys(key[0] for key in self.polygons):
             if name and name not in self.materials.by_name:
-                self.companions.note(f"material '{name}' is not defined: default material used")
+                self.companions.note(
+                    f"material '{name}': not defined, the default material is used"
+                )
         read = [
             self._mesh(name, has_uv and there[0], has_normal and there[1], polygons)
             for (name, has_uv, has_normal), polygons in self.polygons.items()

@@ -215,7 +215,7 @@ class MaterialReader:
                     self.note(f"material '{name}': read from {file.name}")
                     self._keep(*found)
                     return found[0]
-        self.note(f"material '{name}' does not exist: default material used")
+        self.note(f"material '{name}': does not exist, the default material is used")
         return Material(name=name)
 
     def _read_beside(self, owner: Path, text: str) -> NDArray | None:
