@@ -27,7 +27,7 @@ from appearance_opt.evaluate.metrics import compare_images
 from appearance_opt.fit.model import Model, Rates
 from appearance_opt.initial.sphere import sphere
 from appearance_opt.jobs.bake import bake
-from appearance_opt.latent.latent import LatentMesh
+from appearance_opt.latent.mesh import LatentMesh
 from appearance_opt.reference.mesh import MeshReference
 from appearance_opt.render.deferred import render_image
 from appearance_opt.render.pixels import Grid

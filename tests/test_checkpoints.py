@@ -20,7 +20,7 @@ from appearance_opt.fit import archive
 from appearance_opt.fit.checkpoint import Checkpointer
 from appearance_opt.jobs.simplify import fingerprint
 from appearance_opt.jobs.start import Start
-from appearance_opt.latent.latent import LatentMesh
+from appearance_opt.latent.mesh import LatentMesh
 
 
 @dataclass

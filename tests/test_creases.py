@@ -20,7 +20,7 @@ from appearance_opt.baking.target_mesh import movable, unwrap_asset
 from appearance_opt.errors import InputError
 from appearance_opt.initial.decimate import decimate
 from appearance_opt.jobs.simplify import load_source
-from appearance_opt.latent.latent import LatentMesh
+from appearance_opt.latent.mesh import LatentMesh
 
 
 def soup(faces: np.ndarray, attribute: np.ndarray | None = None, header: bytes = b"") -> bytes:

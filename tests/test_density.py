@@ -11,7 +11,7 @@ from appearance_opt.baking.texel_points import TexelPoints, texel_coverage
 from appearance_opt.initial.atlas import charts_of, make_charts, pack_charts, unwrap, uv_areas
 from appearance_opt.initial.density import LARGEST, SMALLEST, chart_scales, halve
 from appearance_opt.initial.sphere import sphere
-from appearance_opt.latent.latent import LatentMesh
+from appearance_opt.latent.mesh import LatentMesh
 from appearance_opt.views import ViewSampler
 
 SIZE = 256

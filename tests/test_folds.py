@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from appearance_opt.asset.types import Asset
-from appearance_opt.fit.folds import Folds
 from appearance_opt.fit.loop import FitOptions, FitResult, fit
 from appearance_opt.fit.model import Model, Rates
 from appearance_opt.fit.validation import Validation
 from appearance_opt.initial.sphere import random_maps, sphere
+from appearance_opt.latent.folds import Folds
 from appearance_opt.reference.mesh import MeshReference
 from appearance_opt.reference.pool import ReferencePool
 from appearance_opt.views import ViewSampler

@@ -13,13 +13,13 @@ from appearance_opt.asset.normals import vertex_normals
 from appearance_opt.asset.tangents import split_and_tangents
 from appearance_opt.backend import to_device
 from appearance_opt.fit import adam
-from appearance_opt.fit.laplacian import Laplacian
 from appearance_opt.fit.loop import laplacians
 from appearance_opt.fit.losses import LOSSES, Target, compared_pixels, image_loss
 from appearance_opt.fit.model import POSITIONS, TEXELS, Model, Rates
 from appearance_opt.fit.step import Gradients, StepInputs, first_non_finite, step
 from appearance_opt.initial.sphere import sphere
-from appearance_opt.latent.latent import LatentMesh, LatentTopology, local_edge_length
+from appearance_opt.latent.laplacian import Laplacian
+from appearance_opt.latent.mesh import LatentMesh, LatentTopology, local_edge_length
 from appearance_opt.latent.texels import TexelCodec
 from appearance_opt.reference.pool import Targets
 from appearance_opt.render import deferred, gradient

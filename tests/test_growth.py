@@ -16,12 +16,12 @@ from appearance_opt.config import SimplifyOptions, simplify_options
 from appearance_opt.errors import InputError
 from appearance_opt.fit import adam
 from appearance_opt.fit.checkpoint import Checkpointer
-from appearance_opt.fit.smoothing import Smoother
 from appearance_opt.initial.sphere import sphere
 from appearance_opt.jobs.growth import stretch
 from appearance_opt.jobs.simplify import simplify
 from appearance_opt.jobs.start import Start
 from appearance_opt.latent.parameter import Parameter
+from appearance_opt.latent.smoothing import Smoother
 from appearance_opt.views import ViewSampler
 
 

@@ -15,7 +15,7 @@ from appearance_opt.fit.model import POSITIONS, TEXELS, Model, Rates
 from appearance_opt.fit.step import Gradients, StepInputs
 from appearance_opt.initial.sphere import sphere
 from appearance_opt.latent.export import to_asset
-from appearance_opt.latent.latent import LatentMesh
+from appearance_opt.latent.mesh import LatentMesh
 from appearance_opt.reference.mesh import MeshReference
 from appearance_opt.reference.pool import Targets
 from appearance_opt.render.deferred import render_image

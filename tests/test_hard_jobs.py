@@ -20,7 +20,7 @@ from appearance_opt.fit.model import Model, Rates
 from appearance_opt.fit.validation import Validation
 from appearance_opt.initial.sphere import sphere
 from appearance_opt.jobs.simplify import simplify
-from appearance_opt.latent.latent import LatentMesh
+from appearance_opt.latent.mesh import LatentMesh
 from appearance_opt.reference.mesh import MeshReference
 from appearance_opt.reference.pool import ReferencePool
 from appearance_opt.views import Views

@@ -17,7 +17,7 @@ from appearance_opt.fit.losses import LOSSES
 from appearance_opt.fit.model import POSITIONS, Model, Rates
 from appearance_opt.fit.step import Gradients
 from appearance_opt.initial.sphere import sphere
-from appearance_opt.latent.latent import LatentMesh
+from appearance_opt.latent.mesh import LatentMesh
 from appearance_opt.render import deferred, gradient
 from appearance_opt.render.pixels import Grid
 from appearance_opt.render.quality import Quality

@@ -21,7 +21,7 @@ from appearance_opt.initial.decimate import decimate_with_source
 from appearance_opt.initial.sheets import separate
 from appearance_opt.jobs.compare import compare
 from appearance_opt.latent.export import to_asset
-from appearance_opt.latent.latent import LatentMesh
+from appearance_opt.latent.mesh import LatentMesh
 from appearance_opt.latent.subdivision import tessellate
 
 ONE_SIDED = Material(double_sided=False, roughness=0.8)

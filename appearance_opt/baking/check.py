@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from appearance_opt.asset.types import Asset
-    from appearance_opt.latent.latent import LatentMesh
+    from appearance_opt.latent.mesh import LatentMesh
 
 OUTSIDE = 1e-5
 """How far texture coordinates may lie outside the unit square: exporters round."""

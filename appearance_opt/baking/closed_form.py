@@ -27,7 +27,7 @@ from appearance_opt.render.surface import face_normal
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from appearance_opt.latent.latent import LatentMesh
+    from appearance_opt.latent.mesh import LatentMesh
     from appearance_opt.reference.mesh import MeshReference
     from appearance_opt.render.surface import Hit
 

@@ -15,7 +15,7 @@ from appearance_opt.render.surface import face_normal
 
 if TYPE_CHECKING:
     from appearance_opt.baking.texel_points import Points
-    from appearance_opt.latent.latent import LatentMesh
+    from appearance_opt.latent.mesh import LatentMesh
     from appearance_opt.reference.mesh import MeshReference
     from appearance_opt.render.passing import Half
 

@@ -13,7 +13,7 @@ from appearance_opt.asset.sides import single_sided
 from appearance_opt.asset.tangents import split_and_tangents
 from appearance_opt.asset.types import Asset, Material
 from appearance_opt.initial.sheets import separate
-from appearance_opt.latent.latent import LatentMesh
+from appearance_opt.latent.mesh import LatentMesh
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -11,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from appearance_opt.asset.normals import vertex_normals
-from appearance_opt.latent.latent import LatentMesh, LatentTopology
+from appearance_opt.latent.mesh import LatentMesh, LatentTopology
 from appearance_opt.render import upload
 from appearance_opt.render.surface import Hit, Surface, interpolate_at
 

@@ -12,15 +12,15 @@ import numpy as np
 from appearance_opt.errors import DivergedError
 from appearance_opt.fit import adam
 from appearance_opt.fit.checkpoint import Checkpointer, FitState
-from appearance_opt.fit.folds import Folds
-from appearance_opt.fit.laplacian import Laplacian
 from appearance_opt.fit.losses import loss_of_name
 from appearance_opt.fit.model import POSITIONS, Model
 from appearance_opt.fit.schedule import Clock, laplacian_weight, learning_rate
 from appearance_opt.fit.step import Gradients, StepInputs, StepResult, first_non_finite, step
 from appearance_opt.fit.validation import Validation
 from appearance_opt.latent.displacement import DISPLACEMENT
-from appearance_opt.latent.latent import local_edge_length
+from appearance_opt.latent.folds import Folds
+from appearance_opt.latent.laplacian import Laplacian
+from appearance_opt.latent.mesh import local_edge_length
 from appearance_opt.render.display import BACKGROUND as GREY
 from appearance_opt.render.pixels import Grid
 from appearance_opt.render.quality import Quality
@@ -57,7 +57,7 @@ class FitOptions:
     name of ``losses.LOSSES``. ``laplacian``: weight relative to the first image loss, at a
     deviation of a tenth of an edge length (0: none). ``relative``: the start is a likeness: hold
     its Laplacian rather than 0, and hand out no triangle that has turned over since (see
-    ``folds``). ``decay``: powers of ten by which the rates fall over the fit. ``background``:
+    ``latent.folds``). ``decay``: powers of ten by which the rates fall over the fit. ``background``:
     behind latent and reference. ``quality``: how the latent is sampled; its point width is the
     pool's. ``validate_every``: fraction of the fit between looks at the held-out views. ``seed``:
     of backgrounds, tessellation levels and silhouette points; views have the sampler's."""

@@ -9,10 +9,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from appearance_opt.fit.smoothing import Smoother
 from appearance_opt.latent.displacement import DISPLACEMENT, Tessellator
-from appearance_opt.latent.latent import LatentMesh, LatentTopology, local_edge_length
+from appearance_opt.latent.mesh import LatentMesh, LatentTopology, local_edge_length
 from appearance_opt.latent.parameter import Parameter
+from appearance_opt.latent.smoothing import Smoother
 from appearance_opt.latent.texels import BOUNDS, NORMALS, TexelCodec
 from appearance_opt.render import upload
 from appearance_opt.render.material import CHANNELS, MaterialMaps, TexelLayer
@@ -195,7 +195,7 @@ class Model:
             self.parameters[DISPLACEMENT].rate = mi.Float(edge * rates.displacement)
 
     def precondition(self, strength: float, rate: float) -> None:
-        """Smooth the steps of the positions (see ``fit.smoothing``), with a ``rate`` in units of
+        """Smooth the steps of the positions (see ``latent.smoothing``), with a ``rate`` in units of
         the positions."""
         parameter = self.parameters.get(POSITIONS)
         if parameter is not None:

@@ -17,9 +17,9 @@ from appearance_opt.render.freezing import Frozen, traced
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-    from appearance_opt.fit.laplacian import Laplacian
     from appearance_opt.fit.losses import Loss
     from appearance_opt.fit.model import Model, Shape
+    from appearance_opt.latent.laplacian import Laplacian
     from appearance_opt.reference.pool import Targets
     from appearance_opt.render.freezing import Run
     from appearance_opt.render.material import TexelLayer

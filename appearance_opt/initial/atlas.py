@@ -10,7 +10,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from appearance_opt.initial.sheets import separate
-from appearance_opt.latent.latent import LatentMesh
+from appearance_opt.latent.mesh import LatentMesh
 
 if TYPE_CHECKING:
     import xatlas

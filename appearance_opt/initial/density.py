@@ -15,7 +15,7 @@ import mitsuba as mi
 import numpy as np
 
 from appearance_opt.initial.atlas import charts_of, uv_areas
-from appearance_opt.latent.latent import LatentTopology
+from appearance_opt.latent.mesh import LatentTopology
 from appearance_opt.latent.texels import maps_of
 from appearance_opt.render import rays
 from appearance_opt.render.deferred import render_image
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from appearance_opt.latent.latent import LatentMesh
+    from appearance_opt.latent.mesh import LatentMesh
     from appearance_opt.views import ViewSampler
 
 BATCHES, BATCH, RESOLUTION, SAMPLES = 4, 8, 256, 4

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.ndimage import maximum_filter
 
 from appearance_opt.initial.visibility import around, welded_areas
-from appearance_opt.latent.latent import LatentTopology
+from appearance_opt.latent.mesh import LatentTopology
 from appearance_opt.latent.texels import maps_of
 from appearance_opt.render import rays
 from appearance_opt.render.deferred import render_image
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from appearance_opt.latent.latent import LatentMesh
+    from appearance_opt.latent.mesh import LatentMesh
     from appearance_opt.reference.mesh import MeshReference
     from appearance_opt.views import ViewSampler
 

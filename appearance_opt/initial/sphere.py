@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from appearance_opt.initial.atlas import unwrap
-from appearance_opt.latent.latent import LatentMesh
+from appearance_opt.latent.mesh import LatentMesh
 
 SMALLEST = 12
 """Triangles of the coarsest sphere, a cube."""

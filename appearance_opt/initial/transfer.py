@@ -10,7 +10,7 @@ from appearance_opt.baking.closed_form import BakedMaps, Settings, bake
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from appearance_opt.latent.latent import LatentMesh
+    from appearance_opt.latent.mesh import LatentMesh
     from appearance_opt.reference.mesh import MeshReference
 
 SAMPLES = 1

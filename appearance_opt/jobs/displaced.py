@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from appearance_opt.asset.types import Asset
     from appearance_opt.config import CommonOptions
     from appearance_opt.fit.model import Model
-    from appearance_opt.latent.latent import LatentMesh
+    from appearance_opt.latent.mesh import LatentMesh
     from appearance_opt.placement import Placement
     from appearance_opt.reference.mesh import MeshReference
 

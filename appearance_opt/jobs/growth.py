@@ -2,7 +2,7 @@
 or mended from a mesh that another tool has spoilt.
 
 The sphere gets several times the triangles of the budget, small maps, small views and
-preconditioned steps (``fit.smoothing``): shape first. What comes out is decimated to the budget
+preconditioned steps (``latent.smoothing``): shape first. What comes out is decimated to the budget
 like any other mesh, which puts triangles where the shape needs them (a sphere that was pulled into
 limbs has few at their ends), and its maps are transferred to an atlas of full size.
 """
@@ -27,7 +27,7 @@ from appearance_opt.interrupts import Interrupts
 from appearance_opt.jobs.fitting import VALIDATION_VIEWS, clean_maps
 from appearance_opt.jobs.start import Start, select_told, transfer_appearance
 from appearance_opt.latent.export import to_asset
-from appearance_opt.latent.latent import LatentMesh
+from appearance_opt.latent.mesh import LatentMesh
 from appearance_opt.reference.mesh import MeshReference
 from appearance_opt.reference.pool import ReferencePool
 from appearance_opt.views import VALIDATION

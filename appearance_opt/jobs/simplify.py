@@ -273,7 +273,7 @@ class _Job:
 
     def _make_or_resume(self, make: Callable[[], tuple[Start, bool]]) -> tuple[Start, bool]:
         from appearance_opt.jobs.start import Start
-        from appearance_opt.latent.latent import LatentMesh
+        from appearance_opt.latent.mesh import LatentMesh
 
         if self.checkpointer is None:
             return make()

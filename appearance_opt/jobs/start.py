@@ -30,7 +30,7 @@ from appearance_opt.jobs.displaced import (
 )
 from appearance_opt.jobs.parts import split
 from appearance_opt.latent.displacement import DISPLACEMENT
-from appearance_opt.latent.latent import LatentMesh
+from appearance_opt.latent.mesh import LatentMesh
 from appearance_opt.reference.mesh import MeshReference
 from appearance_opt.render import upload
 from appearance_opt.render.material import COLORS, UNLIT

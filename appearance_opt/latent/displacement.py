@@ -16,7 +16,7 @@ import mitsuba as mi
 import numpy as np
 
 from appearance_opt.latent import mesh_ops
-from appearance_opt.latent.latent import LatentMesh, LatentTopology, corners_of, edges_around
+from appearance_opt.latent.mesh import LatentMesh, LatentTopology, corners_of, edges_around
 from appearance_opt.latent.subdivision import tessellate
 from appearance_opt.render.math import unit
 

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from appearance_opt.latent.latent import LatentMesh
+    from appearance_opt.latent.mesh import LatentMesh
 
 
 def to_asset(

@@ -17,7 +17,7 @@ class Parameter:
 
     ``rate``: learning rates, one per channel (``channels`` values) or one per element (as wide as
     ``value``). ``low``, ``high``: bounds per channel, or None. ``smooth``: a symmetric linear map
-    that preconditions its steps (see ``fit.smoothing``), or None.
+    that preconditions its steps (see ``latent.smoothing``), or None.
     """
 
     name: str

@@ -15,7 +15,7 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
-from appearance_opt.latent.latent import LatentMesh
+from appearance_opt.latent.mesh import LatentMesh
 
 MAX_LEVEL = 4
 """Deepest tessellation: 256 triangles for each one of the base mesh."""

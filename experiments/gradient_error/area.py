@@ -19,7 +19,7 @@ import numpy as np
 from appearance_opt import backend
 from appearance_opt.fit.model import POSITIONS, Model, Rates
 from appearance_opt.initial.sphere import sphere
-from appearance_opt.latent.latent import LatentMesh
+from appearance_opt.latent.mesh import LatentMesh
 from appearance_opt.render import deferred, gradient, silhouette, silhouette_walk
 from appearance_opt.render.pixels import Grid
 from appearance_opt.render.quality import Quality

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from appearance_opt.asset.normals import weld
 from appearance_opt.initial.sphere import sphere
-from appearance_opt.latent.latent import LatentMesh, LatentTopology
+from appearance_opt.latent.mesh import LatentMesh, LatentTopology
 from appearance_opt.render.material import MaterialMaps
 from appearance_opt.render.surface import Surface
 from appearance_opt.views import Views, look_at

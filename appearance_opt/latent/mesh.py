@@ -1,4 +1,4 @@
-"""The latent: fixed connectivity, an atlas, and the parameters of the job on the device."""
+"""The mesh of a latent: its fixed connectivity and atlas, on the host and on the device."""
 
 from __future__ import annotations
 

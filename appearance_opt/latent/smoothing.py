@@ -15,7 +15,7 @@ import numpy as np
 from scipy.sparse import coo_matrix, csc_matrix, identity
 from scipy.sparse.linalg import splu
 
-from appearance_opt.fit.laplacian import edges_of
+from appearance_opt.latent.laplacian import edges_of
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
