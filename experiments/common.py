@@ -89,9 +89,9 @@ class Placed:
     ``placement``, its ``reference`` and the ``sampler`` of its views."""
 
     def __init__(self, asset: Asset, seed: int = 0) -> None:
-        from appearance_opt.jobs.parts import split
         from appearance_opt.placement import Placement
         from appearance_opt.reference.mesh import MeshReference
+        from appearance_opt.stages.parts import split
         from appearance_opt.views import views_around
 
         asset = split(asset, asset.name, "fit").fitted

@@ -19,8 +19,8 @@ from appearance_opt.errors import InputError
 from appearance_opt.fit import archive
 from appearance_opt.fit.checkpoint import Checkpointer
 from appearance_opt.jobs.simplify import fingerprint
-from appearance_opt.jobs.start import Start
 from appearance_opt.latent.mesh import LatentMesh
+from appearance_opt.stages.start import Start
 
 
 @dataclass

@@ -23,14 +23,6 @@ from appearance_opt.fit.loop import FitOptions, level_of
 from appearance_opt.fit.model import POSITIONS, TEXELS, Model, Rates
 from appearance_opt.fit.validation import Validation
 from appearance_opt.initial.sphere import sphere
-from appearance_opt.jobs.displaced import (
-    REACH,
-    bake_displacement,
-    map_size,
-    median_edge,
-    without_outliers,
-    write_companion,
-)
 from appearance_opt.jobs.joint import joint
 from appearance_opt.jobs.simplify import SimplifyResult, simplify
 from appearance_opt.latent.displacement import DISPLACEMENT, Tessellator, footprint
@@ -38,6 +30,14 @@ from appearance_opt.latent.subdivision import tessellate
 from appearance_opt.latent.texels import TexelCodec
 from appearance_opt.reference.mesh import MeshReference
 from appearance_opt.reference.pool import ReferencePool
+from appearance_opt.stages.displacement import (
+    REACH,
+    bake_displacement,
+    map_size,
+    median_edge,
+    without_outliers,
+    write_companion,
+)
 from appearance_opt.views import ViewSampler
 from scenes.analytic import bumps, bumpy_sphere
 from tests.kernels import BLOCK, settles

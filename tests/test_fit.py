@@ -23,11 +23,11 @@ from appearance_opt.fit.schedule import laplacian_weight
 from appearance_opt.fit.step import Gradients, StepInputs
 from appearance_opt.fit.validation import Validation
 from appearance_opt.initial.sphere import random_maps, sphere
-from appearance_opt.jobs.fitting import fit_policy
 from appearance_opt.jobs.simplify import simplify
 from appearance_opt.reference.mesh import MeshReference
 from appearance_opt.reference.pool import ReferencePool
 from appearance_opt.render.quality import Quality
+from appearance_opt.stages.fitting import fit_policy
 from appearance_opt.views import ViewSampler
 from tests.kernels import FIRST, LATER, looks_settle
 

@@ -17,6 +17,7 @@ FLOORS = (
     ("render",),
     ("latent", "reference", "baking", "initial"),
     ("fit",),
+    ("stages",),
     ("evaluate",),
     ("jobs",),
     ("cli", "__init__", "__main__"),

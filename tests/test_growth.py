@@ -17,11 +17,11 @@ from appearance_opt.errors import InputError
 from appearance_opt.fit import adam
 from appearance_opt.fit.checkpoint import Checkpointer
 from appearance_opt.initial.sphere import sphere
-from appearance_opt.jobs.growth import stretch
 from appearance_opt.jobs.simplify import simplify
-from appearance_opt.jobs.start import Start
 from appearance_opt.latent.parameter import Parameter
 from appearance_opt.latent.smoothing import Smoother
+from appearance_opt.stages.growth import stretch
+from appearance_opt.stages.start import Start
 from appearance_opt.views import ViewSampler
 
 

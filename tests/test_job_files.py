@@ -21,7 +21,7 @@ from appearance_opt.config import (
     simplify_options,
 )
 from appearance_opt.errors import InputError
-from appearance_opt.jobs import start
+from appearance_opt.stages import start
 from scenes.analytic import two_materials
 
 QUICK = {"texture_size": 64, "resolution": 32, "pool": 8, "views": 2, "budget": None}

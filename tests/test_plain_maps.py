@@ -13,10 +13,10 @@ import appearance_opt
 from appearance_opt.asset import save
 from appearance_opt.asset.types import Asset, Material, Mesh, srgb_to_linear
 from appearance_opt.fit.model import Model, Rates
-from appearance_opt.jobs.plain import LOSS, NOISE, STEP, Pictures, replace_constant
 from appearance_opt.latent.export import to_asset
 from appearance_opt.latent.mesh import LatentMesh
 from appearance_opt.reference.mesh import MeshReference
+from appearance_opt.stages.plain import LOSS, NOISE, STEP, Pictures, replace_constant
 from appearance_opt.views import views_around
 from tests.conftest import grid_sphere
 

@@ -11,8 +11,8 @@ from appearance_opt.asset.types import Asset
 from appearance_opt.config import simplify_options
 from appearance_opt.initial.reallocate import HIGHEST, LOWEST, StartError, weights
 from appearance_opt.initial.sphere import sphere
-from appearance_opt.jobs.start import affordable, make_start
 from appearance_opt.reference.mesh import MeshReference
+from appearance_opt.stages.start import affordable, make_start
 from appearance_opt.views import ViewSampler
 from scenes.analytic import bumpy_sphere
 
@@ -95,7 +95,7 @@ def black_on(side: float) -> MeshReference:
 
 def test_triangles_move_to_where_something_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
-        "appearance_opt.jobs.start.WORTHWHILE", 2.0
+        "appearance_opt.stages.start.WORTHWHILE", 2.0
     )  # the moved ones are taken, whatever they gain
     monkeypatch.setattr("appearance_opt.initial.reallocate.RESOLUTION", 128)
     share = []

@@ -17,11 +17,11 @@ from appearance_opt.errors import InputError
 from appearance_opt.interrupts import Interrupts
 from appearance_opt.jobs import report
 from appearance_opt.jobs.bake import BakeJob
-from appearance_opt.jobs.fitting import Stopwatch
-from appearance_opt.jobs.parts import split
 from appearance_opt.jobs.simplify import fingerprint
-from appearance_opt.jobs.start import atlas_of
 from appearance_opt.placement import Placement
+from appearance_opt.stages.fitting import Stopwatch
+from appearance_opt.stages.parts import split
+from appearance_opt.stages.start import atlas_of
 from tests.conftest import grid_sphere
 
 QUICK = {"texture_size": 64, "resolution": 48, "pool": 4, "views": 2, "steps": 0, "reallocate": 0}

@@ -15,10 +15,10 @@ from appearance_opt.asset import load, write
 from appearance_opt.asset.alpha import seen_through
 from appearance_opt.errors import DivergedError, InputError
 from appearance_opt.interrupts import Interrupts
-from appearance_opt.jobs.parts import split
 from appearance_opt.jobs.paths import Outputs
 from appearance_opt.placement import Placement
 from appearance_opt.publish import Publication, publication
+from appearance_opt.stages.parts import split
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -30,8 +30,8 @@ if TYPE_CHECKING:
     from appearance_opt.baking.target_mesh import Low
     from appearance_opt.config import BakeOptions
     from appearance_opt.fit.loop import FitResult, Progress
-    from appearance_opt.jobs.fitting import Stopwatch
-    from appearance_opt.jobs.parts import Parts
+    from appearance_opt.stages.fitting import Stopwatch
+    from appearance_opt.stages.parts import Parts
     from appearance_opt.views import ViewSampler
 
 log = logging.getLogger(__name__)
@@ -84,7 +84,7 @@ def bake(
     ``<out's stem>_maps``. ``inputs``: other files that must not be replaced. Raises
     AppearanceError.
     """
-    from appearance_opt.jobs.fitting import Stopwatch
+    from appearance_opt.stages.fitting import Stopwatch
 
     if options.joint:
         raise InputError(
@@ -108,7 +108,7 @@ def _bake(
     watch: Stopwatch,
     interrupts: Interrupts,
 ) -> BakeResult:
-    from appearance_opt.jobs.fitting import conclude
+    from appearance_opt.stages.fitting import conclude
 
     run = BakeJob(
         *read_pair(high, low, outputs, options, variants, watch), options, watch, interrupts
@@ -253,8 +253,8 @@ class BakeJob:
     ) -> tuple[BakeResult, DivergedError | None]:
         """The closed form, and the fit that starts from it."""
         from appearance_opt.baking.closed_form import bake as bake_closed_form
-        from appearance_opt.jobs.fitting import fit_start
-        from appearance_opt.jobs.start import Start, select_told
+        from appearance_opt.stages.fitting import fit_start
+        from appearance_opt.stages.start import Start, select_told
 
         self.watch.begin("casting rays from texels")
         baked = bake_closed_form(self.reference, self.mesh, self._settings())

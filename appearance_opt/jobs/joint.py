@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from appearance_opt.config import BakeOptions
     from appearance_opt.fit.loop import Progress
     from appearance_opt.jobs.bake import BakeJob
-    from appearance_opt.jobs.fitting import Stopwatch
+    from appearance_opt.stages.fitting import Stopwatch
 
 LAPLACIAN = 0.25
 """Weight of the Laplacian, as by default in a simplification."""
@@ -40,7 +40,7 @@ def joint(
     result to ``out`` (None: do not write). LOW keeps its topology and its texture coordinates; each
     kind of detail goes where it is represented best. ``inputs``: other files that must not be
     replaced. Raises AppearanceError."""
-    from appearance_opt.jobs.fitting import Stopwatch
+    from appearance_opt.stages.fitting import Stopwatch
 
     watch = Stopwatch(began, progress)
     outputs = Outputs.of(out, options, report=report)
@@ -61,8 +61,8 @@ def _fit_pair(
     interrupts: Interrupts,
 ) -> SimplifyResult:
     from appearance_opt.jobs.bake import BakeJob, read_pair
-    from appearance_opt.jobs.displaced import require_memory
-    from appearance_opt.jobs.fitting import conclude
+    from appearance_opt.stages.displacement import require_memory
+    from appearance_opt.stages.fitting import conclude
 
     parts = read_pair(high, low, outputs, options, variants, watch)
     require_memory(parts[1].fitted.triangle_count, options)
@@ -92,10 +92,10 @@ def _fit_job(
     from appearance_opt.baking.target_mesh import movable
     from appearance_opt.fit.model import Model, Rates
     from appearance_opt.initial.transfer import transfer_emission
-    from appearance_opt.jobs.displaced import Exporter, bake_displacement
-    from appearance_opt.jobs.fitting import clean_maps, fit_start
-    from appearance_opt.jobs.plain import flatten_maps
-    from appearance_opt.jobs.start import Start, select_told
+    from appearance_opt.stages.displacement import Exporter, bake_displacement
+    from appearance_opt.stages.fitting import clean_maps, fit_start
+    from appearance_opt.stages.plain import flatten_maps
+    from appearance_opt.stages.start import Start, select_told
 
     light, with_kept = job.low_parts.fitted, job.low_parts.with_kept
     mesh = movable(job.mesh)

@@ -204,7 +204,7 @@ def _check_names(path: Path, names: list[str]) -> None:
 
 
 def _beside(out: Path) -> tuple[str, ...]:
-    """Patterns of the names that the writers of ``asset`` and ``jobs.displaced`` give to what lies
+    """Patterns of the names that the writers of ``asset`` and ``stages.displacement`` give to what lies
     beside ``out``."""
     stem = escape(out.stem)
     displacement = f"{stem}_displacement*.png"

@@ -13,10 +13,10 @@ from appearance_opt.config import CommonOptions, SimplifyOptions, with_values
 from appearance_opt.digest import digest
 from appearance_opt.errors import DivergedError, InputError
 from appearance_opt.interrupts import Interrupts
-from appearance_opt.jobs.parts import split
 from appearance_opt.jobs.paths import Outputs, level_path
 from appearance_opt.placement import Placement
 from appearance_opt.publish import publication
+from appearance_opt.stages.parts import split
 from appearance_opt.views import views_around
 
 if TYPE_CHECKING:
@@ -25,10 +25,10 @@ if TYPE_CHECKING:
     from appearance_opt.asset.types import Asset
     from appearance_opt.fit.checkpoint import Checkpointer
     from appearance_opt.fit.loop import FitResult, Progress
-    from appearance_opt.jobs.fitting import Stopwatch
-    from appearance_opt.jobs.growth import Effort
-    from appearance_opt.jobs.parts import Parts
-    from appearance_opt.jobs.start import Start
+    from appearance_opt.stages.fitting import Stopwatch
+    from appearance_opt.stages.growth import Effort
+    from appearance_opt.stages.parts import Parts
+    from appearance_opt.stages.start import Start
 
 log = logging.getLogger(__name__)
 
@@ -82,11 +82,11 @@ def simplify(
     state is kept every few seconds; with ``resume`` a run goes on from there. ``variants``: USD
     variant selections. ``began``: ``time.perf_counter()`` at which the time budget began, if before
     this call. ``inputs``: other files that must not be replaced. Transparent meshes of the source
-    pass into the result as they are (see ``jobs.parts``). Ctrl-C ends the fit early and still
+    pass into the result as they are (see ``stages.parts``). Ctrl-C ends the fit early and still
     writes the best state so far, the third one gives it up; once the result is written it ends the
     report. Raises AppearanceError.
     """
-    from appearance_opt.jobs.fitting import Stopwatch
+    from appearance_opt.stages.fitting import Stopwatch
 
     watch = Stopwatch(began, progress)
     outputs = Outputs.of(out, options, report=report, checkpoint=checkpoint)
@@ -109,7 +109,7 @@ def _simplify(
     watch: Stopwatch,
     interrupts: Interrupts,
 ) -> SimplifyResult:
-    from appearance_opt.jobs.fitting import conclude
+    from appearance_opt.stages.fitting import conclude
 
     watch.begin(
         f"reading {Path(source).name}" if isinstance(source, (str, Path)) else "checking the asset"
@@ -161,7 +161,7 @@ def _simplify(
 
 def write_result(result: SimplifyResult, out: Path, options: CommonOptions) -> None:
     """The result and what belongs to it, all of it or nothing. Raises OSError."""
-    from appearance_opt.jobs.displaced import write_companion
+    from appearance_opt.stages.displacement import write_companion
 
     with publication() as together:
         write(result.asset, together.place(out))
@@ -210,16 +210,16 @@ class _Job:
         interrupts: Interrupts,
         with_report: bool,
     ) -> None:
-        from appearance_opt.jobs.fitting import seconds_left
-        from appearance_opt.jobs.growth import grow_start, mend_start
-        from appearance_opt.jobs.start import (
+        from appearance_opt.reference.mesh import MeshReference
+        from appearance_opt.stages.fitting import seconds_left
+        from appearance_opt.stages.growth import grow_start, mend_start
+        from appearance_opt.stages.start import (
             atlas_of,
             budget,
             inherit_sides,
             make_start,
             transfer_appearance,
         )
-        from appearance_opt.reference.mesh import MeshReference
 
         self.options, self.watch, self.interrupts = options, watch, interrupts
         self.progress, self.checkpointer, self.with_report = progress, checkpointer, with_report
@@ -272,8 +272,8 @@ class _Job:
         return self._make_or_resume(lambda: (make(), False))[0]
 
     def _make_or_resume(self, make: Callable[[], tuple[Start, bool]]) -> tuple[Start, bool]:
-        from appearance_opt.jobs.start import Start
         from appearance_opt.latent.mesh import LatentMesh
+        from appearance_opt.stages.start import Start
 
         if self.checkpointer is None:
             return make()
@@ -281,8 +281,8 @@ class _Job:
 
     def _fit_shape(self, make_within: Callable[[Effort], tuple[Start, bool]]) -> Start:
         """A start whose shape is fitted first, in a part of the time or the steps."""
-        from appearance_opt.jobs.fitting import seconds_left
-        from appearance_opt.jobs.growth import SHARE, Effort
+        from appearance_opt.stages.fitting import seconds_left
+        from appearance_opt.stages.growth import SHARE, Effort
 
         o = self.options
         seconds = seconds_left(o, self.watch, self.with_report)
@@ -303,9 +303,9 @@ class _Job:
         """Fit the start; see ``simplify``."""
         from appearance_opt.fit.model import Model, Rates
         from appearance_opt.initial.transfer import transfer_emission
-        from appearance_opt.jobs.displaced import Exporter
-        from appearance_opt.jobs.fitting import clean_maps, fit_start
-        from appearance_opt.jobs.plain import flatten_maps
+        from appearance_opt.stages.displacement import Exporter
+        from appearance_opt.stages.fitting import clean_maps, fit_start
+        from appearance_opt.stages.plain import flatten_maps
 
         o = self.options
         model, fitted, error = fit_start(

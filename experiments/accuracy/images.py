@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 
 from appearance_opt.asset import Asset, load
 from appearance_opt.asset.types import Mesh, Texture, linear_to_srgb
-from appearance_opt.jobs.parts import split
 from appearance_opt.placement import Placement
 from appearance_opt.reference.mesh import MeshReference
 from appearance_opt.render.pixels import Grid
+from appearance_opt.stages.parts import split
 from appearance_opt.views import Views, ViewSampler
 from experiments import mitsuba_peer
 

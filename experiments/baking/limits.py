@@ -61,8 +61,8 @@ def limits(asset: str, steps: int, views: int) -> dict:
     from appearance_opt.fit.model import Model, Rates
     from appearance_opt.fit.validation import Validation
     from appearance_opt.jobs.bake import BakeJob
-    from appearance_opt.jobs.fitting import POOL_SAMPLES, Stopwatch, fit_policy, point_width
     from appearance_opt.reference.pool import ReferencePool
+    from appearance_opt.stages.fitting import POOL_SAMPLES, Stopwatch, fit_policy, point_width
     from appearance_opt.views import MEASURED, Views
 
     backend.select("cpu")

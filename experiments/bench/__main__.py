@@ -111,11 +111,11 @@ def run_case(
     from appearance_opt.fit.loop import LOSS_EVERY
     from appearance_opt.fit.losses import LOSSES
     from appearance_opt.fit.step import Gradients, StepInputs, first_non_finite, step
-    from appearance_opt.jobs.fitting import POOL_SAMPLES, point_width
     from appearance_opt.latent.laplacian import Laplacian
     from appearance_opt.reference.pool import ReferencePool, Targets
     from appearance_opt.render.pixels import Grid
     from appearance_opt.render.quality import Quality
+    from appearance_opt.stages.fitting import POOL_SAMPLES, point_width
     from experiments.bench.scene import set_up
 
     source, model, sampler = set_up(latent, reference, maps, room)

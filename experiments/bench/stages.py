@@ -18,12 +18,12 @@ from appearance_opt import backend
 from appearance_opt.fit import adam
 from appearance_opt.fit.losses import LOSSES, Target, compared_pixels, covered_loss, image_loss
 from appearance_opt.fit.model import POSITIONS, TEXELS, Shape
-from appearance_opt.jobs.fitting import point_width
 from appearance_opt.render import gradient
 from appearance_opt.render.freezing import Frozen
 from appearance_opt.render.material import TexelLayer
 from appearance_opt.render.pixels import Grid
 from appearance_opt.render.quality import Quality
+from appearance_opt.stages.fitting import point_width
 from experiments.bench.scene import set_up
 
 REPEATS = 15

@@ -16,11 +16,11 @@ from appearance_opt.fit.loop import FitOptions
 from appearance_opt.fit.model import Model, Rates
 from appearance_opt.fit.validation import Validation
 from appearance_opt.initial.sphere import random_maps
-from appearance_opt.jobs import growth
-from appearance_opt.jobs.fitting import POOL_SAMPLES, VALIDATION_VIEWS, fit_policy, point_width
-from appearance_opt.jobs.start import Start, make_start
 from appearance_opt.reference.mesh import MeshReference
 from appearance_opt.reference.pool import ReferencePool
+from appearance_opt.stages import growth
+from appearance_opt.stages.fitting import POOL_SAMPLES, VALIDATION_VIEWS, fit_policy, point_width
+from appearance_opt.stages.start import Start, make_start
 from appearance_opt.views import VALIDATION, ViewSampler
 from experiments.common import Placed, asset
 
@@ -70,7 +70,7 @@ def _validation(reference: MeshReference, sampler: ViewSampler) -> Validation:
 
 def _from_sphere(reference: MeshReference, sampler: ViewSampler, seed: int) -> Case:
     """A sphere of 4,212 triangles becomes spot, with the preconditioned steps of
-    ``jobs.growth``."""
+    ``stages.growth``."""
     mesh = growth.first_shape(1404, sampler, growth.TEXTURE)
     maps = random_maps(growth.TEXTURE, seed, True)
 

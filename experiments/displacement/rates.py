@@ -37,9 +37,9 @@ class Bench:
     def __init__(self, asset: str) -> None:
         from appearance_opt import backend, load, simplify_options
         from appearance_opt.fit.validation import Validation
-        from appearance_opt.jobs.fitting import point_width
-        from appearance_opt.jobs.start import make_start
         from appearance_opt.reference.pool import ReferencePool
+        from appearance_opt.stages.fitting import point_width
+        from appearance_opt.stages.start import make_start
         from appearance_opt.views import VALIDATION
 
         backend.select("cpu")
@@ -58,7 +58,7 @@ class Bench:
         views."""
         from appearance_opt.fit.loop import FitOptions, fit
         from appearance_opt.fit.model import Model, Rates
-        from appearance_opt.jobs.fitting import fit_policy
+        from appearance_opt.stages.fitting import fit_policy
 
         parts, numbers = case.split(":")
         position, displacement, maps = (float(x) for x in numbers.split(","))

@@ -13,14 +13,14 @@ import numpy as np
 from appearance_opt.fit.loop import FitOptions, fit
 from appearance_opt.fit.model import Model, Rates
 from appearance_opt.fit.validation import Validation
-from appearance_opt.jobs.fitting import VALIDATION_VIEWS, fit_policy
 from appearance_opt.reference.pool import ReferencePool
+from appearance_opt.stages.fitting import VALIDATION_VIEWS, fit_policy
 from appearance_opt.views import VALIDATION
 from experiments.speed_vs_error.recorder import Blind, Recorder, Snapshot
 
 if TYPE_CHECKING:
     from appearance_opt.evaluate.metrics import Metrics
-    from appearance_opt.jobs.start import Start
+    from appearance_opt.stages.start import Start
     from experiments.speed_vs_error.setups import Setup
     from experiments.speed_vs_error.subjects import Bench
 

@@ -8,8 +8,8 @@ from dataclasses import dataclass, field, replace
 from appearance_opt.config import CommonOptions, simplify_options
 from appearance_opt.fit.loop import FitOptions
 from appearance_opt.fit.model import Rates
-from appearance_opt.jobs import fitting, growth
 from appearance_opt.render.quality import Quality
+from appearance_opt.stages import fitting, growth
 
 
 @dataclass(frozen=True)

@@ -17,9 +17,9 @@ from appearance_opt.evaluate.comparison import render_asset
 from appearance_opt.evaluate.metrics import compare_images
 from appearance_opt.initial.atlas import unwrap
 from appearance_opt.initial.sphere import random_maps
-from appearance_opt.jobs import growth
-from appearance_opt.jobs.displaced import gutter
-from appearance_opt.jobs.start import Start, budget, make_start, transfer_appearance
+from appearance_opt.stages import growth
+from appearance_opt.stages.displacement import gutter
+from appearance_opt.stages.start import Start, budget, make_start, transfer_appearance
 from appearance_opt.views import MEASURED
 from experiments import common
 from experiments.common import Placed, source_of

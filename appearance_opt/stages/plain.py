@@ -24,8 +24,8 @@ if TYPE_CHECKING:
 
     from appearance_opt.config import CommonOptions
     from appearance_opt.fit.model import Model
-    from appearance_opt.jobs.start import Start
     from appearance_opt.reference.base import Reference
+    from appearance_opt.stages.start import Start
     from appearance_opt.views import ViewSampler
 
 Maps = dict[str, "NDArray[np.float32] | float"]

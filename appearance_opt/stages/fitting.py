@@ -27,8 +27,8 @@ if TYPE_CHECKING:
     from appearance_opt.fit.checkpoint import Checkpointer
     from appearance_opt.fit.loop import Progress
     from appearance_opt.interrupts import Interrupts
-    from appearance_opt.jobs.start import Start
     from appearance_opt.reference.base import Reference
+    from appearance_opt.stages.start import Start
     from appearance_opt.views import ViewSampler
 
 log = logging.getLogger(__name__)

@@ -20,7 +20,12 @@ from appearance_opt.initial.sphere import SMALLEST as SMALLEST_SPHERE
 from appearance_opt.initial.sphere import random_maps, sphere
 from appearance_opt.initial.transfer import transfer
 from appearance_opt.initial.visibility import importance, pixel_counts
-from appearance_opt.jobs.displaced import (
+from appearance_opt.latent.displacement import DISPLACEMENT
+from appearance_opt.latent.mesh import LatentMesh
+from appearance_opt.reference.mesh import MeshReference
+from appearance_opt.render import upload
+from appearance_opt.render.material import COLORS, UNLIT
+from appearance_opt.stages.displacement import (
     REACH,
     bake_displacement,
     flat_map,
@@ -28,12 +33,7 @@ from appearance_opt.jobs.displaced import (
     median_edge,
     require_memory,
 )
-from appearance_opt.jobs.parts import split
-from appearance_opt.latent.displacement import DISPLACEMENT
-from appearance_opt.latent.mesh import LatentMesh
-from appearance_opt.reference.mesh import MeshReference
-from appearance_opt.render import upload
-from appearance_opt.render.material import COLORS, UNLIT
+from appearance_opt.stages.parts import split
 from appearance_opt.views import START, VISIBILITY
 
 if TYPE_CHECKING:

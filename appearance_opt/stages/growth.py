@@ -24,12 +24,12 @@ from appearance_opt.initial.atlas import unwrap
 from appearance_opt.initial.decimate import decimate
 from appearance_opt.initial.sphere import random_maps, sphere
 from appearance_opt.interrupts import Interrupts
-from appearance_opt.jobs.fitting import VALIDATION_VIEWS, clean_maps
-from appearance_opt.jobs.start import Start, select_told, transfer_appearance
 from appearance_opt.latent.export import to_asset
 from appearance_opt.latent.mesh import LatentMesh
 from appearance_opt.reference.mesh import MeshReference
 from appearance_opt.reference.pool import ReferencePool
+from appearance_opt.stages.fitting import VALIDATION_VIEWS, clean_maps
+from appearance_opt.stages.start import Start, select_told, transfer_appearance
 from appearance_opt.views import VALIDATION
 
 if TYPE_CHECKING:
