@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from appearance_opt.asset.types import Asset
+    from appearance_opt.views import Views
 
 
 @dataclass(frozen=True)
@@ -44,6 +45,12 @@ class Placement:
     def to_world(self, points: NDArray) -> NDArray[np.float64]:
         """(N, 3) local points."""
         return np.asarray(points, np.float64) * self.scale + np.array(self.centre)
+
+    def views_to_world(self, views: Views) -> Views:
+        """Local views: the same pictures of the same thing at its size and place in the world."""
+        eye, light = (self.to_world(p).astype(np.float32) for p in (views.eye, views.light))
+        intensity = (views.intensity * self.scale**2).astype(np.float32)
+        return replace(views, eye=eye, light=light, intensity=intensity)
 
     def local(self, asset: Asset) -> Asset:
         """The asset in local coordinates; it has no origin of its own then."""

@@ -85,20 +85,17 @@ def judge(
 
 
 class Placed:
-    """An asset placed for a fit, as a job sees it: ``asset`` in local coordinates, its
-    ``placement``, its ``reference`` and the ``sampler`` of its views."""
+    """An asset placed for a fit, as a job sees it: ``asset`` in local coordinates, the
+    ``subject`` with its ``placement``, its ``reference`` and the ``sampler`` of its views."""
 
     def __init__(self, asset: Asset, seed: int = 0) -> None:
-        from appearance_opt.placement import Placement
-        from appearance_opt.reference.mesh import MeshReference
+        from appearance_opt.reference.subject import Subject
         from appearance_opt.stages.parts import split
-        from appearance_opt.views import views_around
 
         asset = split(asset, asset.name, "fit").fitted
-        self.placement = Placement.around(asset.points())
-        self.asset = self.placement.local(asset)
-        self.reference = MeshReference(self.asset)
-        self.sampler = views_around(self.reference.merged.positions, seed)
+        self.subject = Subject.of_asset(asset, seed)
+        self.placement, self.sampler = self.subject.placement, self.subject.sampler
+        self.asset, self.reference = self.placement.local(asset), self.subject.reference
 
 
 class Kept:

@@ -134,21 +134,21 @@ def rows(name: str, ratios: list[float], decimate: Callable[..., tuple]) -> list
     from appearance_opt.views import VISIBILITY
 
     placed = Placed(loaded(name))
-    merged = placed.reference.merged
-    count = len(merged.faces)
-    pixels = pixel_counts(placed.reference.scene, count, placed.sampler.held_out(VISIBILITY), 160)
-    weight, seen = importance(merged.positions, merged.faces, pixels)
-    before, _ = shapes(merged.positions, merged.faces)
+    heavy = placed.subject.survey.triangles
+    count = len(heavy.faces)
+    pixels = pixel_counts(heavy.scene, count, placed.sampler.held_out(VISIBILITY), 160)
+    weight, seen = importance(heavy.positions, heavy.faces, pixels)
+    before, _ = shapes(heavy.positions, heavy.faces)
     out = []
     for ratio in ratios:
         began = time.perf_counter()
         budget = max(round(ratio * count), LEAST)
         p, f, *_ = decimate(
-            merged.positions,
-            merged.faces[seen],
+            heavy.positions,
+            heavy.faces[seen],
             budget,
             weight[seen],
-            placed.reference.single[seen],
+            heavy.single[seen],
         )
         seconds = time.perf_counter() - began
         slivers, folded = shapes(p, f)

@@ -18,7 +18,6 @@ from appearance_opt.baking.align import align
 from appearance_opt.baking.check import overlap
 from appearance_opt.baking.closed_form import BakedMaps, Settings
 from appearance_opt.baking.closed_form import bake as closed_form
-from appearance_opt.baking.curvature import mean_curvature
 from appearance_opt.baking.target_mesh import prepare, unwrap_asset
 from appearance_opt.baking.texel_points import TexelPoints
 from appearance_opt.config import bake_options, read_toml
@@ -28,7 +27,9 @@ from appearance_opt.fit.model import Model, Rates
 from appearance_opt.initial.sphere import sphere
 from appearance_opt.jobs.bake import bake
 from appearance_opt.latent.mesh import LatentMesh
+from appearance_opt.reference.curvature import mean_curvature
 from appearance_opt.reference.mesh import MeshReference
+from appearance_opt.reference.survey import MeshSurvey
 from appearance_opt.render.deferred import render_image
 from appearance_opt.render.pixels import Grid
 from appearance_opt.views import ViewSampler
@@ -92,7 +93,9 @@ def cube() -> Mesh:
 
 def baked_pair(high: Asset, low: Asset, *fields: str, **settings) -> tuple[BakedMaps, LatentMesh]:
     mesh = prepare(low).mesh
-    return closed_form(MeshReference(high), mesh, Settings(SIZE, fields, **settings)), mesh
+    return closed_form(
+        MeshSurvey(MeshReference(high)), mesh, Settings(SIZE, fields, **settings)
+    ), mesh
 
 
 def texel_rays(mesh: LatentMesh) -> tuple[np.ndarray, ...]:

@@ -30,6 +30,7 @@ from appearance_opt.latent.subdivision import tessellate
 from appearance_opt.latent.texels import TexelCodec
 from appearance_opt.reference.mesh import MeshReference
 from appearance_opt.reference.pool import ReferencePool
+from appearance_opt.reference.survey import MeshSurvey
 from appearance_opt.stages.displacement import (
     REACH,
     bake_displacement,
@@ -117,11 +118,11 @@ def test_rays_that_meet_another_part_leave_no_spikes() -> None:
     hole = inner.positions[inner.faces].mean(axis=1)[:, 1] > 0.85 * inner.positions[:, 1].max()
     holed = replace(inner, faces=inner.faces[~hole])
     shell = replace(outer, positions=outer.positions * np.float32(1.15))
-    reference = MeshReference(Asset((holed, shell)))
+    survey = MeshSurvey(MeshReference(Asset((holed, shell))))
     radius = float(np.linalg.norm(inner.positions, axis=1).mean())
     mesh, o = sphere(1200, (0.0, 0.0, 0.0), radius, 128), options(subdivision=1)
-    far = bake_displacement(reference, mesh, o)[1][DISPLACEMENT]
-    near = bake_displacement(reference, mesh, o, REACH * median_edge(mesh))[1][DISPLACEMENT]
+    far = bake_displacement(survey, mesh, o)[1][DISPLACEMENT]
+    near = bake_displacement(survey, mesh, o, REACH * median_edge(mesh))[1][DISPLACEMENT]
     assert far.max() > 0.1 * radius  # it is there to be met
     assert np.abs(near).max() < REACH * median_edge(mesh) < 0.1 * radius
 

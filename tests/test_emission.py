@@ -13,6 +13,7 @@ import pytest
 import appearance_opt
 from appearance_opt.asset import Asset, Texture, load, save
 from appearance_opt.reference.mesh import MeshReference
+from appearance_opt.reference.survey import Found, MeshSurvey, Place
 
 FACTOR = (3.0, 1.5, 0.75)
 QUICK = {"steps": 0, "pool": 4, "views": 2, "resolution": 64, "texture_size": 128}
@@ -35,7 +36,9 @@ def emitted(asset: Asset) -> tuple[np.ndarray, np.ndarray]:
     reference = MeshReference(asset)
     faces = reference.merged.faces
     third = dr.full(mi.Float, 1 / 3, len(faces))
-    rgb = reference.emission_at(dr.arange(mi.UInt32, len(faces)), third, third, mi.Float(1e-6))
+    place = Place(dr.arange(mi.UInt32, len(faces)), third, third)
+    found = Found(mi.Float(0), dr.full(mi.Bool, True, len(faces)), place)
+    rgb = MeshSurvey(reference).emission(found, mi.Float(1e-6))
     height = reference.merged.positions[faces][..., 1].mean(axis=1)
     return height, np.stack([np.broadcast_to(np.array(c), len(faces)) for c in rgb], axis=1)
 

@@ -18,6 +18,7 @@ from appearance_opt.initial.transfer import transfer
 from appearance_opt.initial.visibility import importance, pixel_counts
 from appearance_opt.latent.export import to_asset
 from appearance_opt.reference.mesh import MeshReference
+from appearance_opt.reference.survey import MeshSurvey
 from appearance_opt.render import upload
 from appearance_opt.views import ViewSampler
 
@@ -159,7 +160,7 @@ def test_transfer_onto_the_same_shape_looks_the_same(ball: Asset) -> None:
     reference = MeshReference(ball)
     p, f = decimate(reference.merged.positions, reference.merged.faces, 1000)
     mesh = unwrap(p, f, 128)
-    result = transfer(reference, mesh, 128)
+    result = transfer(MeshSurvey(reference), mesh, 128)
     assert result.missed.sum() == 0
     out = to_asset(mesh, mesh.positions, result.maps, "low")
     views = ViewSampler((0.0, 0.0, 0.0), 1.0).draw(0, 4)
@@ -190,7 +191,9 @@ def test_texels_that_nobody_sees_are_filled_smoothly() -> None:
     reference = MeshReference(box_on_a_plinth())
     first, place = weld(reference.merged.positions)
     mesh = unwrap(reference.merged.positions[first], place[reference.merged.faces], 128)
-    plain, filled = (transfer(reference, mesh, 128, fill_hidden=f) for f in (False, True))
+    plain, filled = (
+        transfer(MeshSurvey(reference), mesh, 128, fill_hidden=f) for f in (False, True)
+    )
     before, after = (
         np.stack([r.maps[c] for c in ("red", "green", "blue")], axis=-1) for r in (plain, filled)
     )

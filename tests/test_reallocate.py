@@ -12,6 +12,8 @@ from appearance_opt.config import simplify_options
 from appearance_opt.initial.reallocate import HIGHEST, LOWEST, StartError, weights
 from appearance_opt.initial.sphere import sphere
 from appearance_opt.reference.mesh import MeshReference
+from appearance_opt.reference.subject import Subject
+from appearance_opt.reference.survey import MeshSurvey
 from appearance_opt.stages.start import affordable, make_start
 from appearance_opt.views import ViewSampler
 from scenes.analytic import bumpy_sphere
@@ -37,19 +39,25 @@ def test_weights_follow_the_error() -> None:
     assert uneven.min() >= LOWEST and uneven.max() <= HIGHEST
 
 
+def subject_of(asset: Asset) -> Subject:
+    """An asset as it lies, in the views of ``SAMPLER``."""
+    reference = MeshReference(asset)
+    return Subject(reference, SAMPLER, survey=MeshSurvey(reference))
+
+
 @pytest.fixture(scope="module")
-def bumps() -> MeshReference:
-    return MeshReference(bumpy_sphere(20_000, 128))
+def bumps() -> Subject:
+    return subject_of(bumpy_sphere(20_000, 128))
 
 
-def test_the_error_of_a_start_is_found_where_it_is(bumps: MeshReference) -> None:
+def test_the_error_of_a_start_is_found_where_it_is(bumps: Subject) -> None:
     options = simplify_options(triangles=800, texture_size=128, reallocate=0)
-    start = make_start(bumps, options, SAMPLER, 800)
-    judge = StartError(bumps, SAMPLER.held_out(3), views=16)
+    start = make_start(bumps, options, 800)
+    judge = StartError(bumps.reference, bumps.survey.triangles, SAMPLER.held_out(3), views=16)
     whole, by_face = judge.measure(start.mesh, start.maps)
-    assert by_face.shape == (len(bumps.merged.faces),) and by_face.sum() > 0
+    assert by_face.shape == (len(bumps.survey.triangles.faces),) and by_face.sum() > 0
     # one side is dented: the error rises there
-    u = bumps.merged.positions[bumps.merged.faces].mean(axis=1)[:, 0]
+    u = bumps.survey.triangles.positions[bumps.survey.triangles.faces].mean(axis=1)[:, 0]
     moved = start.mesh.positions.copy()
     moved[moved[:, 0] > 0.3] *= 0.9
     dented, dented_by_face = judge.measure(
@@ -64,19 +72,19 @@ def test_the_error_of_a_start_is_found_where_it_is(bumps: MeshReference) -> None
     assert rise[u > 0.3].sum() > 3 * rise[u < -0.3].sum()
 
 
-def test_the_best_start_of_all_rounds_is_kept(bumps: MeshReference) -> None:
-    judge = StartError(bumps, SAMPLER.held_out(3), views=16)
+def test_the_best_start_of_all_rounds_is_kept(bumps: Subject) -> None:
+    judge = StartError(bumps.reference, bumps.survey.triangles, SAMPLER.held_out(3), views=16)
     error = []
     for rounds in (0, 1):
         options = simplify_options(triangles=500, texture_size=128, reallocate=rounds)
-        start = make_start(bumps, options, SAMPLER, 500)
+        start = make_start(bumps, options, 500)
         assert len(start.mesh.faces) <= 500
         error.append(judge.measure(start.mesh, start.maps)[0])
     # by other views than those that it was chosen by
     assert error[1] < 1.02 * error[0]
 
 
-def black_on(side: float) -> MeshReference:
+def black_on(side: float) -> Subject:
     """Bumps of the same heights all around, but the side of -x or +x is black: whatever its shape,
     little is seen."""
     asset = bumpy_sphere(5_000, 128)
@@ -90,7 +98,7 @@ def black_on(side: float) -> MeshReference:
         base_color_texture=replace(mesh.material.base_color_texture, pixels=pixels),
         orm_texture=None, roughness=1.0, metalness=0.0,
     )  # fmt: skip
-    return MeshReference(replace(asset, meshes=(replace(mesh, material=material),)))
+    return subject_of(replace(asset, meshes=(replace(mesh, material=material),)))
 
 
 def test_triangles_move_to_where_something_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -103,7 +111,6 @@ def test_triangles_move_to_where_something_is_seen(monkeypatch: pytest.MonkeyPat
         start = make_start(
             black_on(side),
             simplify_options(triangles=300, texture_size=128, reallocate=1),
-            SAMPLER,
             300,
         )
         share.append(float((start.mesh.positions[start.mesh.faces].mean(axis=1)[:, 0] > 0).mean()))
@@ -120,9 +127,11 @@ def test_slow_decimations_are_not_repeated(left: float | None, taken: float, rou
 
 
 def test_hidden_starts_have_no_error(ball: Asset) -> None:
-    reference = MeshReference(ball)
+    subject = subject_of(ball)
     far = ViewSampler((50.0, 0.0, 0.0), 1.0)
     options = simplify_options(triangles=200, texture_size=32, reallocate=0)
-    start = make_start(reference, options, SAMPLER, 200)
-    error, by_face = StartError(reference, far, views=8).measure(start.mesh, start.maps)
+    start = make_start(subject, options, 200)
+    error, by_face = StartError(subject.reference, subject.survey.triangles, far, views=8).measure(
+        start.mesh, start.maps
+    )
     assert error == 0.0 and not by_face.any()

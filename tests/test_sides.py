@@ -3,6 +3,8 @@ silhouettes."""
 
 from __future__ import annotations
 
+from functools import partial
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -14,7 +16,7 @@ from appearance_opt.asset.types import Material, Mesh
 from appearance_opt.baking.occlusion import exposed
 from appearance_opt.initial.sphere import sphere
 from appearance_opt.render import raster, rays, upload
-from appearance_opt.render.passing import MISS, SidedScene, meet
+from appearance_opt.render.passing import MISS, SidedScene, blocked, meet
 from appearance_opt.render.pixels import Grid
 from appearance_opt.views import Views, ViewSampler
 
@@ -157,7 +159,10 @@ def test_what_can_be_seen_through_backs_is_exposed() -> None:
     for faces, expected in ((wall[1][:, ::-1], True), (wall[1], False)):
         p, f = joined((wall[0], faces), small)
         scene = upload.scene_of(p, f, culled(p, f, np.ones(len(f), bool)))
-        assert np.array(exposed(scene, points, normal, active, 4.0)).all() == expected
+        assert (
+            np.array(exposed(partial(blocked, scene), points, normal, active, 4.0)).all()
+            == expected
+        )
     # the inner side of the walls is seen, their outer side is not
     p, f = wall[0], wall[1][:, ::-1]
     scene = upload.scene_of(p, f, culled(p, f, np.ones(len(f), bool)))
@@ -166,11 +171,16 @@ def test_what_can_be_seen_through_backs_is_exposed() -> None:
     flat /= np.linalg.norm(flat, axis=1, keepdims=True)
     on, inward = mi.Point3f(corners.mean(axis=1).T), mi.Vector3f(flat.T)
     front_only = dr.full(mi.Bool, True, len(f))
-    assert np.array(exposed(scene, on, inward, front_only, 4.0, front_only)).all()
+    assert np.array(exposed(partial(blocked, scene), on, inward, front_only, 4.0, front_only)).all()
     solid = upload.scene_of(*wall)
-    assert np.array(exposed(solid, on, inward, front_only, 4.0)).all(), "from either side"
+    assert np.array(exposed(partial(blocked, solid), on, inward, front_only, 4.0)).all(), (
+        "from either side"
+    )
     # a ray in a thousand slips through an edge between two triangles
-    assert np.array(exposed(solid, on, inward, front_only, 4.0, front_only)).mean() < 0.05
+    assert (
+        np.array(exposed(partial(blocked, solid), on, inward, front_only, 4.0, front_only)).mean()
+        < 0.05
+    )
 
 
 def test_rays_stop_at_what_counts() -> None:

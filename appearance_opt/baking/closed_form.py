@@ -8,6 +8,7 @@ the size of the maps, but for the maps themselves.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING
 
 import drjit as dr
@@ -15,12 +16,11 @@ import mitsuba as mi
 import numpy as np
 
 from appearance_opt.asset.packing import EMISSION
-from appearance_opt.baking.curvature import mean_curvature
 from appearance_opt.baking.occlusion import exposed, openness
-from appearance_opt.baking.surface_search import Found, Pick, automatic_reach, find
-from appearance_opt.baking.texel_points import Points, TexelPoints, interpolate_packets
+from appearance_opt.baking.reach import automatic_reach
+from appearance_opt.baking.texel_points import Points, TexelPoints
 from appearance_opt.initial.fill import fill
-from appearance_opt.render import upload
+from appearance_opt.render.passing import blocked
 from appearance_opt.render.rays import sub_pixel_offsets
 from appearance_opt.render.surface import face_normal
 
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from appearance_opt.latent.mesh import LatentMesh
-    from appearance_opt.reference.mesh import MeshReference
+    from appearance_opt.reference.survey import Found, Pick, Survey
     from appearance_opt.render.surface import Hit
 
 FIELDS: dict[str, tuple[str, ...]] = {
@@ -84,15 +84,15 @@ class BakedMaps:
         return float(self.missed.sum() / max(int(self.covered.sum()), 1))
 
 
-def bake(reference: MeshReference, mesh: LatentMesh, settings: Settings) -> BakedMaps:
-    """The maps of ``mesh``, whose atlas must lie in the unit square, from the reference."""
+def bake(survey: Survey, mesh: LatentMesh, settings: Settings) -> BakedMaps:
+    """The maps of ``mesh``, whose atlas must lie in the unit square, from the surface of a reference."""
     size = settings.size
     names = [c for f in settings.fields for c in FIELDS[f]]
     values = np.empty((size, size, len(names)), np.float32)
     found, covered, hidden = (np.empty((size, size), bool) for _ in range(3))
     with dr.suspend_grad():
-        reach = automatic_reach(reference, mesh) if settings.reach is None else settings.reach
-        run = _Run(reference, TexelPoints(mesh, size, settings.samples), settings, reach)
+        reach = automatic_reach(survey, mesh) if settings.reach is None else settings.reach
+        run = _Run(survey, TexelPoints(mesh, size, settings.samples), settings, reach)
         for row in range(0, size, run.points.rows):
             sums = run.band(row)[: size - row]
             here = slice(row, row + len(sums))
@@ -120,15 +120,11 @@ class _Run:
     """What every band needs."""
 
     def __init__(
-        self, reference: MeshReference, points: TexelPoints, settings: Settings, reach: float
+        self, survey: Survey, points: TexelPoints, settings: Settings, reach: float
     ) -> None:
-        self.reference, self.points, self.settings = reference, points, settings
+        self.survey, self.points, self.settings = survey, points, settings
         self.reach = dr.opaque(mi.Float, reach)
         self.width = 1 << (sum(len(FIELDS[f]) for f in settings.fields) + 2).bit_length()
-        self.curvature: mi.Float | None = None
-        if "curvature" in settings.fields:
-            merged = reference.merged
-            self.curvature = upload.packets(1, mean_curvature(merged.positions, merged.faces))
 
     def band(self, row: int) -> NDArray[np.float32]:
         """(rows, size, width) sums over the samples of each texel: channels, hits, samples inside a
@@ -142,7 +138,7 @@ class _Run:
         return np.array(total).reshape(rows, size, self.width)
 
     def _add(self, total: mi.Float, points: Points, seed: int) -> None:
-        found = find(self.reference, points, self.reach, self.settings.pick)
+        found = self.survey.find(points.here.position, points.along, self.reach, self.settings.pick)
         dr.eval(found, points)
         hidden = mi.Bool(False)
         if self.settings.fill_hidden:
@@ -167,23 +163,28 @@ class _Run:
         flat = face_normal(self.points.surface, points.triangle, mi.Bool(True))
         flat *= dr.rsqrt(dr.fmax(dr.squared_norm(flat), 1e-30))
         all_ = dr.full(mi.Bool, True, dr.width(points.texel))
-        front_only = _of(self.points.surface.culled, points.triangle)
-        out = exposed(self.points.scene, points.here.position, flat, all_, FAR, front_only)
+        front_only = self._front_only(points)
+        see = partial(blocked, self.points.scene)
+        out = exposed(see, points.here.position, flat, all_, FAR, front_only)
         both = out & found.valid
-        prim = dr.select(found.valid, found.triangle, 0)
-        position, geometric, _ = self.reference.geometry_at(prim, found.b1, found.b2)
-        front_only = _of(self.reference.surface.culled, prim)
+        there = self.survey.geometry(found)
+        front_only = self.survey.front_only(found)
         return ~out | (
-            both & ~exposed(self.reference.scene, position, geometric, both, FAR, front_only)
+            both
+            & ~exposed(self.survey.blocked, there.position, there.normal, both, FAR, front_only)
         )
+
+    def _front_only(self, points: Points) -> mi.Bool | None:
+        """Is each point not to be seen from behind? None if all may be."""
+        culled = self.points.surface.culled
+        return None if culled is None else dr.gather(mi.Bool, culled, points.triangle)
 
     def _values(self, points: Points, found: Found, seed: int) -> list[mi.Float]:
         """All channels of the wanted fields, in order."""
         fields = self.settings.fields
-        prim = dr.select(found.valid, found.triangle, 0)
         out: dict[str, list[mi.Float]] = {}
         if {"material", "normal", "object-normal"} & set(fields):
-            s = self.reference.sample(prim, found.b1, found.b2, points.area)
+            s = self.survey.appearance(found, points.area)
             color = s.base_color
             normal = dr.select(dr.dot(s.normal, points.here.normal) < 0, -s.normal, s.normal)
             out["material"] = [color.x, color.y, color.z, s.roughness, s.metalness]
@@ -193,20 +194,12 @@ class _Run:
         if "ao" in fields:
             o = self.settings
             number = points.texel + dr.opaque(mi.UInt32, seed % 2**32)
-            out["ao"] = [openness(self.reference, found, number, o.ao_rays, o.ao_distance, FAR)]
+            out["ao"] = [openness(self.survey, found, number, o.ao_rays, o.ao_distance, FAR)]
         if "emission" in fields:
-            out["emission"] = self.reference.emission_at(prim, found.b1, found.b2, points.area)
-        if self.curvature is not None:
-            surface = self.reference.surface
-            out["curvature"] = interpolate_packets(
-                surface, self.curvature, prim, found.b1, found.b2, 1
-            )
+            out["emission"] = self.survey.emission(found, points.area)
+        if "curvature" in fields:
+            out["curvature"] = [self.survey.curvature(found)]
         return [x for f in fields for x in out[f]]
-
-
-def _of(culled: mi.Bool | None, triangle: mi.UInt32) -> mi.Bool | None:
-    """Is each triangle culled when it is seen from behind? None if none is."""
-    return None if culled is None else dr.gather(mi.Bool, culled, triangle)
 
 
 def to_tangent_space(here: Hit, normal: mi.Vector3f) -> list[mi.Float]:

@@ -8,13 +8,12 @@ from typing import TYPE_CHECKING
 import drjit as dr
 import mitsuba as mi
 
-from appearance_opt.render.passing import blocked
 from appearance_opt.render.rays import sub_pixel_offsets
 
 if TYPE_CHECKING:
-    from appearance_opt.baking.surface_search import Found
-    from appearance_opt.reference.mesh import MeshReference
-    from appearance_opt.render.passing import Scene
+    from collections.abc import Callable
+
+    from appearance_opt.reference.survey import Found, Survey
 
 LIFT = 1e-4
 """How far rays start above the surface, in units of the object's radius (1 in local units)."""
@@ -26,7 +25,7 @@ less than a hundredth of all directions may be taken for hidden."""
 
 
 def openness(
-    reference: MeshReference, found: Found, seed: mi.UInt32, rays: int, distance: float, far: float
+    survey: Survey, found: Found, seed: mi.UInt32, rays: int, distance: float, far: float
 ) -> mi.Float:
     """Cosine-weighted share of the hemisphere in which nothing is met within ``distance``, in [0,
     1].
@@ -34,8 +33,8 @@ def openness(
     ``rays`` directions per point, a low-discrepancy sequence shifted by a hash of ``seed`` (Cranley
     and Patterson 1976). ``far``: a distance beyond which there is nothing.
     """
-    prim = dr.select(found.valid, found.triangle, 0)
-    position, geometric, normal = reference.geometry_at(prim, found.b1, found.b2)
+    there = survey.geometry(found)
+    position, geometric, normal = there.position, there.normal, there.smooth
     tangent = dr.normalize(
         dr.cross(normal, dr.select(dr.abs(normal.x) < 0.9, mi.Vector3f(1, 0, 0), [0, 1, 0]))
     )
@@ -54,14 +53,14 @@ def openness(
         # the interpolated normal's hemisphere dips below coarse faces: turn such rays up again
         below = dr.dot(d, geometric)
         d = dr.select(below < 0, d - geometric * (2 * below), d)
-        hit = blocked(reference.scene, mi.Ray3f(origin, d, length, 0, mi.Color0f()), found.valid)
+        hit = survey.blocked(mi.Ray3f(origin, d, length, 0, mi.Color0f()), found.valid)
         free += dr.select(hit, mi.Float(0), mi.Float(1))
         dr.eval(free)
     return free * dr.opaque(mi.Float, 1 / rays)
 
 
 def exposed(
-    scene: Scene,
+    blocked: Callable[[mi.Ray3f, mi.Bool], mi.Bool],
     position: mi.Point3f,
     normal: mi.Vector3f,
     active: mi.Bool,
@@ -69,9 +68,9 @@ def exposed(
     culled: mi.Bool | None = None,
 ) -> mi.Bool:
     """Which of the ``active`` points of a surface something outside can see, from either side:
-    those from which some ray gets away. Where parts touch, both surfaces are hidden. ``far``: a
-    distance beyond which there is nothing. ``culled``: points that are seen from the side of their
-    ``normal`` only."""
+    those from which some ray is not ``blocked`` (rays, which of them count). Where parts touch,
+    both surfaces are hidden. ``far``: a distance beyond which there is nothing. ``culled``: points
+    that are seen from the side of their ``normal`` only."""
     out = dr.zeros(mi.Bool, dr.width(position))
     left = dr.compress(active)
     length = dr.opaque(mi.Float, far)
@@ -90,9 +89,7 @@ def exposed(
                 d = dr.select(below & front_only, -d, d)
                 below &= ~front_only
             side = dr.select(below, mi.Float(-LIFT), mi.Float(LIFT))
-            hidden &= blocked(
-                scene, mi.Ray3f(dr.fma(n, side, p), d, length, 0, mi.Color0f()), hidden
-            )
+            hidden &= blocked(mi.Ray3f(dr.fma(n, side, p), d, length, 0, mi.Color0f()), hidden)
             dr.eval(hidden)
         dr.scatter(out, ~hidden, left)
         left = dr.gather(mi.UInt32, left, dr.compress(hidden))

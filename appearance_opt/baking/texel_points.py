@@ -13,7 +13,7 @@ import numpy as np
 from appearance_opt.asset.normals import vertex_normals
 from appearance_opt.latent.mesh import LatentMesh, LatentTopology
 from appearance_opt.render import upload
-from appearance_opt.render.surface import Hit, Surface, interpolate_at
+from appearance_opt.render.surface import Hit, interpolate_at, interpolate_packets
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -91,24 +91,6 @@ class TexelPoints:
                 *interpolate_packets(self.surface, self._directions, triangle, b1, b2, 4)[:3]
             )
         )
-
-
-def interpolate_packets(
-    surface: Surface,
-    values: mi.Float,
-    triangle: mi.UInt32,
-    b1: mi.Float,
-    b2: mi.Float,
-    channels: int,
-) -> list[mi.Float]:
-    """Values per vertex (packets of ``channels``) at barycentric points of triangles."""
-    n = dr.width(triangle)
-    face = dr.gather(mi.ArrayXu, surface.faces, triangle, shape=(4, n))
-    rows = [dr.gather(mi.ArrayXf, values, face[k], shape=(channels, n)) for k in range(3)]
-    b0 = 1 - b1 - b2
-    return [
-        dr.fma(rows[0][c], b0, dr.fma(rows[1][c], b1, rows[2][c] * b2)) for c in range(channels)
-    ]
 
 
 def atlas_scene(mesh: LatentMesh) -> mi.Scene:

@@ -30,7 +30,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from appearance_opt.latent.mesh import LatentMesh
-    from appearance_opt.reference.mesh import MeshReference
+    from appearance_opt.reference.base import Reference
+    from appearance_opt.reference.survey import Triangles
     from appearance_opt.views import ViewSampler
 
 VIEWS, BATCH, RESOLUTION, SAMPLES = 64, 8, 256, 4
@@ -50,22 +51,27 @@ POWER, LOWEST, HIGHEST = 0.35, 0.3, 3.0
 
 class StartError:
     """How far a start looks from the reference, over views that neither the fit nor its validation
-    uses."""
+    uses. ``triangles``: those of the reference on which the error is collected."""
 
-    def __init__(self, reference: MeshReference, sampler: ViewSampler, views: int = VIEWS) -> None:
-        self.reference = reference
+    def __init__(
+        self,
+        reference: Reference,
+        triangles: Triangles,
+        sampler: ViewSampler,
+        views: int = VIEWS,
+    ) -> None:
+        self.triangles = triangles
         self._grid = Grid(BATCH, RESOLUTION)
-        self._records = [sampler.draw(k, BATCH).records() for k in range(views // BATCH)]
-        self._images = [
-            self._display(reference.render_device(r, self._grid, SAMPLES)) for r in self._records
-        ]
+        drawn = [sampler.draw(k, BATCH) for k in range(views // BATCH)]
+        self._records = [v.records() for v in drawn]
+        self._images = [display(reference.render(v, RESOLUTION, SAMPLES)) for v in drawn]
 
     def measure(
         self, mesh: LatentMesh, maps: Mapping[str, NDArray | float]
     ) -> tuple[float, NDArray[np.float64]]:
         """(mean squared display error, its sum over the pixels that show each face of the reference
         (F,))."""
-        total = dr.zeros(mi.UInt64, len(self.reference.merged.faces))
+        total = dr.zeros(mi.UInt64, len(self.triangles.faces))
         topology = LatentTopology(mesh, tangents=True)
         scene = topology.scene()
         layers = maps_of(maps)
@@ -88,7 +94,7 @@ class StartError:
     def _collect(self, total: mi.UInt64, records: mi.Float, error: mi.Float) -> None:
         g = self._grid
         hits = rays.trace(
-            self.reference.scene,
+            self.triangles.scene,
             records,
             g.view,
             mi.Float(g.column) + 0.5,

@@ -183,8 +183,7 @@ class BakeJob:
     ) -> None:
         from appearance_opt.baking import check
         from appearance_opt.baking.target_mesh import prepare, unwrap_asset
-        from appearance_opt.reference.mesh import MeshReference
-        from appearance_opt.views import views_around
+        from appearance_opt.reference.subject import Subject
 
         self.options, self.watch, self.interrupts, self.low_parts = (
             options,
@@ -211,10 +210,11 @@ class BakeJob:
             check.check_overlap(self.low.mesh, name)
         watch.lap("check")
         self.placement = Placement.around(np.concatenate([high.points(), low.points()]))
-        self.reference = MeshReference(self.placement.local(high))
+        self.subject = Subject.of_asset(high, options.seed, options.light, self.placement)
+        assert self.subject.survey is not None
+        self.survey = self.subject.survey
         local = self.placement.relative_to(low.origin).to_local(self.low.mesh.positions)
         self.mesh = replace(self.low.mesh, positions=local.astype(np.float32))
-        self.sampler = views_around(self.reference.merged.positions, options.seed, options.light)
         watch.lap("reference")
 
     def _align(self, high_parts: Parts, low: Asset) -> tuple[Asset, Asset]:
@@ -241,7 +241,7 @@ class BakeJob:
 
         low = self.low_parts.whole
         if not any(map(seen_through, (*self.high.meshes, *low.meshes))):
-            return self.sampler, self.placement
+            return self.subject.sampler, self.placement
         points = np.concatenate([self.high.points(), low.points()])
         placement = Placement.around(points)
         return views_around(
@@ -257,7 +257,7 @@ class BakeJob:
         from appearance_opt.stages.start import Start, select_told
 
         self.watch.begin("casting rays from texels")
-        baked = bake_closed_form(self.reference, self.mesh, self._settings())
+        baked = bake_closed_form(self.survey, self.mesh, self._settings())
         self.check_missed(baked)
         self.watch.lap("closed form")
         closed = self._result(baked.maps)
@@ -276,14 +276,14 @@ class BakeJob:
             return result, None
         start = Start(
             self.mesh,
-            select_told(self.reference, {n: baked.maps[n] for n in _FITTED}),
+            select_told(self.subject.unlit, {n: baked.maps[n] for n in _FITTED}),
             True,
             baked.covered,
         )
         options = replace(self.options, fit=parts)
         model, fitted, error = fit_start(
-            self.reference,
-            self.sampler,
+            self.subject.reference,
+            self.subject.sampler,
             start,
             options,
             self.watch,
@@ -309,7 +309,7 @@ class BakeJob:
 
         o, scale = self.options, self.placement.scale
         wanted = {n for n in FIELDS if o.wants(n)}
-        if self.reference.emission is None and "emission" in wanted:
+        if not self.survey.emits and "emission" in wanted:
             wanted.remove("emission")
             if "emission" in o.maps:
                 self.notes.append("HIGH emits no light: there is no emission map")
@@ -331,7 +331,7 @@ class BakeJob:
         """What the fit moves: parts that are written. Colour and roughness are fitted together or
         not at all."""
         o = self.options
-        if self.reference.unlit:
+        if self.subject.unlit:
             written = {"normal": False, "material": o.wants("base-color")}
         else:
             both = o.wants("base-color") and o.wants("orm")
@@ -361,7 +361,7 @@ class BakeJob:
         from appearance_opt.baking.encode import material_change
         from appearance_opt.baking.target_mesh import with_material
 
-        change = material_change(self._in_metres(maps), self.options, self.reference.unlit)
+        change = material_change(self._in_metres(maps), self.options, self.subject.unlit)
         asset = with_material(self.low.asset, change)
         if self.options.wants(
             "base-color"

@@ -99,15 +99,15 @@ def _fit_job(
 
     light, with_kept = job.low_parts.fitted, job.low_parts.with_kept
     mesh = movable(job.mesh)
-    drawn, displacement = bake_displacement(job.reference, mesh, options, job.cage)
-    found = bake(job.reference, drawn, Settings(options.texture_size, samples=options.samples))
+    drawn, displacement = bake_displacement(job.survey, mesh, options, job.cage)
+    found = bake(job.survey, drawn, Settings(options.texture_size, samples=options.samples))
     job.check_missed(found)
     maps = {
         n: v for n, v in found.maps.items() if options.wants("normal") or not n.startswith("normal")
     }
     start = Start(
         mesh,
-        {**select_told(job.reference, maps), **displacement},
+        {**select_told(job.subject.unlit, maps), **displacement},
         True,
         found.covered,
         options.levels(),
@@ -115,8 +115,8 @@ def _fit_job(
     job.watch.lap("closed form")
     parts = tuple(dict.fromkeys(("shape", *options.fit)))
     model, fitted, error = fit_start(
-        job.reference,
-        job.sampler,
+        job.subject.reference,
+        job.subject.sampler,
         start,
         replace(options, fit=parts),
         job.watch,
@@ -129,14 +129,14 @@ def _fit_job(
     initial = Model(mesh, start.maps, frozenset(), Rates(), start.levels[-1:])
     final = clean_maps(model, start.known)
     if options.wants("emission"):
-        final |= transfer_emission(job.reference, model.posed_mesh(), options.texture_size)
-    final = flatten_maps(model, final, start, job.reference, job.sampler, options)
+        final |= transfer_emission(job.survey, model.posed_mesh(), options.texture_size)
+    final = flatten_maps(model, final, start, job.subject.reference, job.subject.sampler, options)
     result = SimplifyResult(
         with_kept(exporter.base(model, final)),
         with_kept(exporter.drawn(initial, start.maps)[initial.level]),
         fitted,
         len(mesh.faces),
-        len(job.reference.merged.faces),
+        len(job.survey.triangles.faces),
         notes=[*job.notes, *fitted.notes()],
         error=error,
         tessellated={k: with_kept(a) for k, a in exporter.drawn(model, final).items()},

@@ -140,7 +140,7 @@ def _simplify(
     interrupts.release()
     if result.error is not None:
         raise result.error
-    placement, sampler = run.placement, run.sampler
+    placement, sampler = run.subject.placement, run.subject.sampler
     if parts.kept:  # they may lie outside of what the fit's views show
         points = parts.whole.points()
         placement = Placement.around(points)
@@ -210,7 +210,7 @@ class _Job:
         interrupts: Interrupts,
         with_report: bool,
     ) -> None:
-        from appearance_opt.reference.mesh import MeshReference
+        from appearance_opt.reference.subject import Subject
         from appearance_opt.stages.fitting import seconds_left
         from appearance_opt.stages.growth import grow_start, mend_start
         from appearance_opt.stages.start import (
@@ -218,6 +218,7 @@ class _Job:
             budget,
             inherit_sides,
             make_start,
+            require_survey,
             transfer_appearance,
         )
 
@@ -231,40 +232,36 @@ class _Job:
             ),
         ]
         watch.begin(f"preparing {asset.triangle_count:,} triangles")
-        self.placement = Placement.around(asset.points())
-        self.reference = MeshReference(self.placement.local(asset))
+        self.subject = Subject.of_asset(asset, options.seed, options.light)
         watch.lap("reference")
-        self.sampler = views_around(self.reference.merged.positions, options.seed, options.light)
+        survey = require_survey(self.subject)
+        single = survey.triangles.single
         if options.init == "sphere" and "shape" in options.fit and not options.displaced:
             triangles = budget(options, asset.triangle_count)
             self.start = self._fit_shape(
-                lambda effort: grow_start(self.reference, self.sampler, options, triangles, effort)
+                lambda effort: grow_start(self.subject, options, triangles, effort)
             )
         elif options.init in ("decimate", "sphere"):
             triangles = budget(options, asset.triangle_count)
             left = seconds_left(options, watch, with_report)
             self.start = self._make_start(
-                lambda: make_start(
-                    self.reference, options, self.sampler, triangles, left, watch.begin
-                )
+                lambda: make_start(self.subject, options, triangles, left, watch.begin)
             )
         else:
             assert first is not None
             mesh, notes = atlas_of(
-                first, self.placement, asset.triangle_count, options, self.reference.single
+                first, self.subject.placement, asset.triangle_count, options, single
             )
             self.notes += notes
             if options.relative is False and "shape" in options.fit and not options.displaced:
                 self.start = self._fit_shape(
-                    lambda effort: mend_start(self.reference, self.sampler, options, mesh, effort)
+                    lambda effort: mend_start(self.subject, options, mesh, effort)
                 )
                 # the shape has been let go of; the mended one is a likeness
                 self.options = with_values(self.options, relative=None)
             else:
-                self.start = self._make_start(
-                    lambda: transfer_appearance(self.reference, mesh, options)
-                )
-        self.start = inherit_sides(self.start, self.reference.single)
+                self.start = self._make_start(lambda: transfer_appearance(survey, mesh, options))
+        self.start = inherit_sides(self.start, single)
         watch.lap("start")
 
     def _make_start(self, make: Callable[[], Start]) -> Start:
@@ -306,11 +303,12 @@ class _Job:
         from appearance_opt.stages.displacement import Exporter
         from appearance_opt.stages.fitting import clean_maps, fit_start
         from appearance_opt.stages.plain import flatten_maps
+        from appearance_opt.stages.start import require_survey
 
         o = self.options
         model, fitted, error = fit_start(
-            self.reference,
-            self.sampler,
+            self.subject.reference,
+            self.subject.sampler,
             self.start,
             o,
             self.watch,
@@ -323,14 +321,16 @@ class _Job:
         )
         asset = self.parts.fitted
         name = f"{asset.name}_{len(self.start.mesh.faces)}"
-        exporter = Exporter(self.placement, asset.origin, name)
+        exporter = Exporter(self.subject.placement, asset.origin, name)
         initial = Model(
             self.start.mesh, self.start.maps, frozenset(), Rates(), self.start.levels[-1:]
         )
         begin = exporter.drawn(initial, self.start.maps)[initial.level]
         maps = clean_maps(model, self.start.known)
-        maps |= transfer_emission(self.reference, model.posed_mesh(), o.texture_size)
-        maps = flatten_maps(model, maps, self.start, self.reference, self.sampler, o)
+        maps |= transfer_emission(require_survey(self.subject), model.posed_mesh(), o.texture_size)
+        maps = flatten_maps(
+            model, maps, self.start, self.subject.reference, self.subject.sampler, o
+        )
         result = exporter.base(model, maps)
         tessellated = exporter.drawn(model, maps) if o.displaced else {}
         self.watch.lap("export")

@@ -1,4 +1,4 @@
-"""What the fit asks of a reference renderer: images, nothing else."""
+"""What the fit asks of a reference renderer: where the object lies, and images."""
 
 from __future__ import annotations
 
@@ -14,10 +14,17 @@ if TYPE_CHECKING:
 class Reference(Protocol):
     """A black box that hands out images.
 
+    ``bounds`` (2, 3): least and greatest corner of an axis-aligned box that holds all that it
+    shows, in the coordinates of the views that it is given (right-handed, any unit of length, y up
+    by glTF's convention). Views are framed to it.
+
     ``render`` returns (B, H, W, 4) float32: premultiplied linear radiance and coverage in [0, 1],
     averaged over the pixel's area (``samples`` says how finely), background black and uncovered.
     Rows run downward.
     """
+
+    @property
+    def bounds(self) -> NDArray[np.floating]: ...
 
     def render(self, views: Views, resolution: int, samples: int = 16) -> NDArray[np.float32]: ...
 

@@ -11,15 +11,14 @@ import numpy as np
 
 from appearance_opt.asset.alpha import seen_through
 from appearance_opt.asset.batch import Batch, fill_normals, replace_chosen
-from appearance_opt.asset.packing import EMISSION
 from appearance_opt.asset.sides import culled, single_sided
 from appearance_opt.asset.tangents import any_tangent, split_and_tangents
 from appearance_opt.reference.textures import coverage_maps, emission_maps, material_maps
 from appearance_opt.render import deferred, layers, upload
 from appearance_opt.render.freezing import Frozen
-from appearance_opt.render.material import UNLIT, evaluate, shading_normal
+from appearance_opt.render.material import UNLIT
 from appearance_opt.render.pixels import Grid
-from appearance_opt.render.surface import Surface, face_normal, interpolate_at
+from appearance_opt.render.surface import Surface
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -49,8 +48,7 @@ class MergedMesh:
 
 
 class MeshReference:
-    """Renders an asset. Also answers what its surface looks like at given points (for the
-    transfer).
+    """Renders an asset. ``survey.MeshSurvey`` answers what its surface looks like.
 
     ``merged``: the host arrays; ``single`` (F,): faces that are seen from their front only;
     ``scene``: for tracing rays; ``surface``, ``maps``: device data; ``emission``: what the
@@ -93,6 +91,12 @@ class MeshReference:
         )
         self._run = Frozen(self.surface, self.maps, self.coverage)
         self._grid: Grid | None = None
+
+    @property
+    def bounds(self) -> NDArray[np.floating]:
+        """See ``Reference``."""
+        p = self.merged.positions
+        return np.stack([p.min(axis=0), p.max(axis=0)])
 
     @property
     def unlit(self) -> bool:
@@ -153,56 +157,9 @@ class MeshReference:
                 )
             return deferred.render_image(*drawn, records, grid, samples, width, self._run)
 
-    def sample(
-        self, triangle: mi.UInt32, b1: mi.Float, b2: mi.Float, area: mi.Float
-    ) -> SurfaceSample:
-        """Appearance at barycentric points of triangles, averaged over a patch of ``area`` (world
-        units squared). Used by the closed-form transfer."""
-        with dr.suspend_grad():
-            hit = interpolate_at(self.surface, triangle, b1, b2, area)
-            sample = evaluate(self.maps, hit)
-            return SurfaceSample(
-                sample.base_color, sample.roughness, sample.metalness, shading_normal(hit, sample)
-            )
-
-    def emission_at(
-        self, triangle: mi.UInt32, b1: mi.Float, b2: mi.Float, area: mi.Float
-    ) -> list[mi.Float]:
-        """Emitted linear RGB at the same points as ``sample``. Only for a reference with
-        ``emission``."""
-        assert self.emission is not None
-        if not self.emission.layers:
-            return [mi.Float(self.emission.constants[name]) for name in EMISSION]
-        with dr.suspend_grad():
-            hit = interpolate_at(self.surface, triangle, b1, b2, area)
-            return self.emission.layers[0].at(hit)[:3]
-
-    def geometry_at(
-        self, triangle: mi.UInt32, b1: mi.Float, b2: mi.Float
-    ) -> tuple[mi.Point3f, mi.Vector3f, mi.Vector3f]:
-        """(position, normal of the triangle by its winding, interpolated vertex normal), the last
-        turned to the side of the first; unit vectors."""
-        with dr.suspend_grad():
-            hit = interpolate_at(self.surface, triangle, b1, b2, mi.Float(0))
-            geometric = face_normal(self.surface, triangle, mi.Bool(True))
-            geometric *= dr.rsqrt(dr.fmax(dr.squared_norm(geometric), 1e-30))
-            smooth = dr.select(dr.dot(hit.normal, geometric) < 0, -hit.normal, hit.normal)
-            return hit.position, geometric, smooth
-
 
 def _host(image: mi.Float, grid: Grid) -> NDArray[np.float32]:
     return np.array(image).reshape(grid.views, grid.resolution, grid.resolution, 4)
-
-
-@dataclass
-class SurfaceSample:
-    """Appearance of a reference at points of its surface: linear base colour, roughness, metalness,
-    unit shading normal in world space."""
-
-    base_color: mi.Color3f
-    roughness: mi.Float
-    metalness: mi.Float
-    normal: mi.Vector3f
 
 
 def merge(asset: Asset, material_of: list[int], need_tangents: bool) -> MergedMesh:

@@ -187,3 +187,21 @@ def _packet(buffer: mi.Float, index: mi.UInt32, channels: int) -> mi.ArrayXf:
     return dr.gather(
         mi.ArrayXf, buffer, index, mode=dr.ReduceMode.Expand, shape=(channels, dr.width(index))
     )
+
+
+def interpolate_packets(
+    surface: Surface,
+    values: mi.Float,
+    triangle: mi.UInt32,
+    b1: mi.Float,
+    b2: mi.Float,
+    channels: int,
+) -> list[mi.Float]:
+    """Values per vertex (packets of ``channels``) at barycentric points of triangles."""
+    n = dr.width(triangle)
+    face = dr.gather(mi.ArrayXu, surface.faces, triangle, shape=(4, n))
+    rows = [dr.gather(mi.ArrayXf, values, face[k], shape=(channels, n)) for k in range(3)]
+    b0 = 1 - b1 - b2
+    return [
+        dr.fma(rows[0][c], b0, dr.fma(rows[1][c], b1, rows[2][c] * b2)) for c in range(channels)
+    ]

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from appearance_opt.fit.model import Model
     from appearance_opt.latent.mesh import LatentMesh
     from appearance_opt.placement import Placement
-    from appearance_opt.reference.mesh import MeshReference
+    from appearance_opt.reference.survey import Survey
 
 FILLED = 0.6
 """Share of an atlas that its charts cover, about."""
@@ -100,14 +100,14 @@ def flat_map(mesh: LatentMesh, options: CommonOptions) -> NDArray[np.float32]:
 
 
 def bake_displacement(
-    reference: MeshReference, mesh: LatentMesh, options: CommonOptions, reach: float | None = None
+    survey: Survey, mesh: LatentMesh, options: CommonOptions, reach: float | None = None
 ) -> tuple[LatentMesh, dict[str, NDArray[np.float32]]]:
     """Closed form: the displacement map that rays along the interpolated normals find within
     ``reach`` (None: the automatic cage), and the mesh that it makes at the finest level, to whose
     tangent bases the other maps belong."""
     size, level = map_size(mesh, options), max(options.levels())
     settings = Settings(size, (DISPLACEMENT,), samples=SAMPLES, reach=reach)
-    found = bake(reference, mesh, settings).maps[DISPLACEMENT]
+    found = bake(survey, mesh, settings).maps[DISPLACEMENT]
     found = without_outliers(found, OUTLIER * median_edge(mesh) / 2**level)
     with dr.suspend_grad():
         tessellator = Tessellator(mesh, level, tangents=False)

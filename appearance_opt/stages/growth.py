@@ -28,8 +28,9 @@ from appearance_opt.latent.export import to_asset
 from appearance_opt.latent.mesh import LatentMesh
 from appearance_opt.reference.mesh import MeshReference
 from appearance_opt.reference.pool import ReferencePool
+from appearance_opt.reference.survey import MeshSurvey
 from appearance_opt.stages.fitting import VALIDATION_VIEWS, clean_maps
-from appearance_opt.stages.start import Start, select_told, transfer_appearance
+from appearance_opt.stages.start import Start, require_survey, select_told, transfer_appearance
 from appearance_opt.views import VALIDATION
 
 if TYPE_CHECKING:
@@ -39,7 +40,7 @@ if TYPE_CHECKING:
 
     from appearance_opt.config import SimplifyOptions
     from appearance_opt.fit.loop import Progress
-    from appearance_opt.reference.base import Reference
+    from appearance_opt.reference.subject import Subject
     from appearance_opt.views import ViewSampler
 
 log = logging.getLogger(__name__)
@@ -86,25 +87,25 @@ class Effort:
 
 
 def grow_start(
-    reference: Reference,
-    sampler: ViewSampler,
+    subject: Subject,
     options: SimplifyOptions,
     triangles: int,
     effort: Effort,
 ) -> tuple[Start, bool]:
     """(start, interrupted), grown from a sphere. Only images of the reference are used."""
     texture = min(TEXTURE, options.texture_size)
-    mesh = first_shape(triangles, sampler, texture)
+    mesh = first_shape(triangles, subject.sampler, texture)
     maps = select_told(
-        reference,
+        subject.unlit,
         random_maps(texture, options.seed, options.normal_map and "normal" in options.fit),
     )
-    model, result = _fit_shape(reference, sampler, options, mesh, maps, 1.0, effort)
+    model, result = _fit_shape(subject, options, mesh, maps, 1.0, effort)
     likeness = to_asset(
         mesh, model.host_positions(), clean_maps(model, np.zeros((texture, texture), bool)), "grown"
     )
-    source = MeshReference(likeness)
-    positions, faces = decimate(source.merged.positions, source.merged.faces, triangles)
+    source = MeshSurvey(MeshReference(likeness))
+    grown = source.triangles
+    positions, faces = decimate(grown.positions, grown.faces, triangles)
     if not len(faces):
         raise InputError("nothing is left of the grown mesh at that budget; ask for more triangles")
     start = transfer_appearance(source, unwrap(positions, faces, options.texture_size), options)
@@ -112,8 +113,7 @@ def grow_start(
 
 
 def mend_start(
-    reference: MeshReference,
-    sampler: ViewSampler,
+    subject: Subject,
     options: SimplifyOptions,
     spoilt: LatentMesh,
     effort: Effort,
@@ -122,15 +122,15 @@ def mend_start(
     and maps are made anew. Neighbours move together, so that lost volume comes back and a patch
     that lies off moves as a whole, where steps of single vertices would crumple it."""
     small = with_values(options, texture_size=min(TEXTURE, options.texture_size))
-    maps = transfer_appearance(reference, spoilt, small).maps
-    model, result = _fit_shape(reference, sampler, options, spoilt, maps, MENDING, effort)
+    survey = require_survey(subject)
+    maps = transfer_appearance(survey, spoilt, small).maps
+    model, result = _fit_shape(subject, options, spoilt, maps, MENDING, effort)
     mesh = unwrap(model.host_positions(), spoilt.faces, options.texture_size, single=spoilt.single)
-    return transfer_appearance(reference, mesh, options), result.interrupted
+    return transfer_appearance(survey, mesh, options), result.interrupted
 
 
 def _fit_shape(
-    reference: Reference,
-    sampler: ViewSampler,
+    subject: Subject,
     options: SimplifyOptions,
     mesh: LatentMesh,
     maps: Mapping[str, NDArray | float],
@@ -139,6 +139,7 @@ def _fit_shape(
 ) -> tuple[Model, FitResult]:
     """A mesh with maps after preconditioned steps, ``pace`` times as large as for a sphere; the
     model is left at its best state."""
+    reference, sampler = subject.reference, subject.sampler
     model = Model(mesh, maps, frozenset(options.fit), RATES)
     strength, rate = smoothing(len(mesh.faces))
     model.precondition(strength, pace * rate)

@@ -22,7 +22,6 @@ from appearance_opt.initial.transfer import transfer
 from appearance_opt.initial.visibility import importance, pixel_counts
 from appearance_opt.latent.displacement import DISPLACEMENT
 from appearance_opt.latent.mesh import LatentMesh
-from appearance_opt.reference.mesh import MeshReference
 from appearance_opt.render import upload
 from appearance_opt.render.material import COLORS, UNLIT
 from appearance_opt.stages.displacement import (
@@ -44,8 +43,8 @@ if TYPE_CHECKING:
     from appearance_opt.asset.types import Asset
     from appearance_opt.config import SimplifyOptions
     from appearance_opt.placement import Placement
-    from appearance_opt.reference.base import Reference
-    from appearance_opt.views import ViewSampler
+    from appearance_opt.reference.subject import Subject
+    from appearance_opt.reference.survey import Survey
 
 log = logging.getLogger(__name__)
 
@@ -120,16 +119,15 @@ def budget(options: SimplifyOptions, available: int) -> int:
 
 
 def make_start(
-    reference: MeshReference,
+    subject: Subject,
     options: SimplifyOptions,
-    sampler: ViewSampler,
     triangles: int,
     seconds: float | None = None,
     tell: Callable[[str], None] = lambda _: None,
 ) -> Start:
     """Sphere, or decimated reference. ``seconds``: what is left for start and fit (None: no limit).
     ``tell``: called with what begins, in a few words."""
-    size = options.texture_size
+    size, sampler = options.texture_size, subject.sampler
     if options.init == "sphere":
         if triangles < SMALLEST_SPHERE:
             raise InputError(
@@ -137,7 +135,7 @@ def make_start(
             )
         mesh = sphere(triangles, sampler.centre, 0.6 * sampler.radius, size)
         maps = select_told(
-            reference,
+            subject.unlit,
             random_maps(size, options.seed, options.normal_map and "normal" in options.fit),
         )
         known = np.zeros((size, size), bool)
@@ -150,18 +148,18 @@ def make_start(
                 options.levels(),
             )
         return Start(mesh, {**maps}, False, known)
-    starts = _Decimated(reference, options, sampler, triangles, tell)
+    starts = _Decimated(subject, options, triangles, tell)
     began = time.perf_counter()
     start = starts.decimate(starts.weight)
     taken = time.perf_counter() - began
     if starts.coarse:
         left_out = "decimation began with a coarse round, and triangles were not moved to where they are missed"
-        many = f"{len(reference.merged.faces):,} triangles are many for --budget {options.budget:g}"
+        many = f"{starts.given:,} triangles are many for --budget {options.budget:g}"
         return replace(start, notes=(f"{many}: {left_out}",))
     rounds = affordable(options.reallocate, taken, None if seconds is None else seconds - taken)
     if not rounds:
         return start
-    judge = StartError(reference, starts.views)
+    judge = StartError(subject.reference, starts.survey.triangles, starts.views)
     start, error = starts.move_triangles(start, judge, rounds)
     again = starts.spread_texels(start, len(start.mesh.faces) <= TIGHT_TRIANGLES)
     return again if judge.measure(again.drawn, again.maps)[0] < error else start
@@ -188,33 +186,33 @@ def is_coarse(faces: int, vertices: int, clusters: int, budget: float | None) ->
 
 class _Decimated:
     """Starts from the reference with fewer triangles. ``coarse``: is it clustered first, as it is
-    too large for the time budget? ``positions``, ``faces``, ``single``: what is decimated, the
-    reference's or the clusters'; ``weight``: importance of these faces by how much is seen of them;
-    ``visible``: those that are decimated at all; ``views``: views that neither the fit nor its
-    validation uses."""
+    too large for the time budget? ``given``: faces of the reference; ``positions``, ``faces``,
+    ``single``: what is decimated, its own or the clusters'; ``weight``: importance of these faces
+    by how much is seen of them; ``visible``: those that are decimated at all; ``views``: views that
+    neither the fit nor its validation uses."""
 
     positions: NDArray
     faces: NDArray
 
     def __init__(
         self,
-        reference: MeshReference,
+        subject: Subject,
         options: SimplifyOptions,
-        sampler: ViewSampler,
         triangles: int,
         tell: Callable[[str], None],
     ) -> None:
-        self.tell = tell
-        self.reference, self.options, self.triangles = reference, options, triangles
+        self.tell, self.options, self.triangles = tell, options, triangles
+        self.survey, sampler = require_survey(subject), subject.sampler
         self.views = sampler.held_out(START)
-        merged, scene = reference.merged, reference.scene
-        self.positions, self.faces, self.single = merged.positions, merged.faces, reference.single
+        heavy = self.survey.triangles
+        self.positions, self.faces, self.single = heavy.positions, heavy.faces, heavy.single
+        scene, self.given = heavy.scene, len(heavy.faces)
         clusters = max(CLUSTERS * triangles, LEAST_CLUSTERS)
-        self.coarse = is_coarse(len(merged.faces), len(merged.positions), clusters, options.budget)
+        self.coarse = is_coarse(self.given, len(heavy.positions), clusters, options.budget)
         if self.coarse:
             tell("clustering vertices")
-            self.positions, self.faces, source = cluster(merged.positions, merged.faces, clusters)
-            self.single = reference.single[source]
+            self.positions, self.faces, source = cluster(self.positions, self.faces, clusters)
+            self.single = self.single[source]
             scene = upload.scene_of(
                 self.positions, self.faces, culled(self.positions, self.faces, self.single)
             )
@@ -247,10 +245,10 @@ class _Decimated:
     def move_triangles(self, start: Start, judge: StartError, rounds: int) -> tuple[Start, float]:
         """The best of a start and those with triangles moved to where its image error is, and its
         error."""
-        merged, weight = self.reference.merged, self.weight
+        heavy, weight = self.survey.triangles, self.weight
         best, (error, by_face) = start, judge.measure(start.drawn, start.maps)
         for number in range(1, rounds + 1):
-            weight = weight * weights(merged.positions, merged.faces, by_face, self.visible)
+            weight = weight * weights(heavy.positions, heavy.faces, by_face, self.visible)
             candidate = self.decimate(weight)
             again, by_face = judge.measure(candidate.drawn, candidate.maps)
             log.info(
@@ -280,30 +278,32 @@ class _Decimated:
         mesh = pack_charts(
             charts, scale, options.texture_size, gutter(len(charts.faces), options), tight
         )
-        return replace(transfer_appearance(self.reference, mesh, options), charts=charts)
+        return replace(transfer_appearance(self.survey, mesh, options), charts=charts)
 
 
-def select_told(
-    reference: Reference, maps: Mapping[str, NDArray | float]
-) -> dict[str, NDArray | float]:
-    """Those of a start's maps that images of the reference tell of: where it is not lit, colours
+def require_survey(subject: Subject) -> Survey:
+    """The surface of a subject. Raises InputError if only images are known of it."""
+    if subject.survey is None:
+        raise InputError(
+            "images are all that is known of this reference: start from a mesh or a sphere"
+        )
+    return subject.survey
+
+
+def select_told(unlit: bool, maps: Mapping[str, NDArray | float]) -> dict[str, NDArray | float]:
+    """Those of a start's maps that images of the reference tell of: where it is ``unlit``, colours
     alone."""
-    unlit = isinstance(reference, MeshReference) and reference.unlit
     return {**{n: maps[n] for n in COLORS}, UNLIT: 1.0} if unlit else dict(maps)
 
 
-def transfer_appearance(
-    reference: MeshReference, mesh: LatentMesh, options: SimplifyOptions
-) -> Start:
+def transfer_appearance(survey: Survey, mesh: LatentMesh, options: SimplifyOptions) -> Start:
     """A mesh with the reference's appearance in its maps."""
     finest = None
     displacement: dict[str, NDArray] = {}
     if options.displaced:
-        finest, displacement = bake_displacement(
-            reference, mesh, options, REACH * median_edge(mesh)
-        )
+        finest, displacement = bake_displacement(survey, mesh, options, REACH * median_edge(mesh))
     result = transfer(
-        reference, mesh if finest is None else finest, options.texture_size, not options.keep_hidden
+        survey, mesh if finest is None else finest, options.texture_size, not options.keep_hidden
     )
     missed = result.missed.sum() / max(int(result.covered.sum()), 1)
     if missed > 0.01:
@@ -316,7 +316,7 @@ def transfer_appearance(
     }
     return Start(
         mesh,
-        {**select_told(reference, maps), **displacement},
+        {**select_told(survey.unlit, maps), **displacement},
         True,
         result.covered,
         options.levels(),

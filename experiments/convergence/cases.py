@@ -16,12 +16,12 @@ from appearance_opt.fit.loop import FitOptions
 from appearance_opt.fit.model import Model, Rates
 from appearance_opt.fit.validation import Validation
 from appearance_opt.initial.sphere import random_maps
-from appearance_opt.reference.mesh import MeshReference
 from appearance_opt.reference.pool import ReferencePool
+from appearance_opt.reference.subject import Subject
 from appearance_opt.stages import growth
 from appearance_opt.stages.fitting import POOL_SAMPLES, VALIDATION_VIEWS, fit_policy, point_width
 from appearance_opt.stages.start import Start, make_start
-from appearance_opt.views import VALIDATION, ViewSampler
+from appearance_opt.views import VALIDATION
 from experiments.common import Placed, asset
 
 if TYPE_CHECKING:
@@ -58,20 +58,21 @@ def make_case(name: str, seed: int) -> Case:
     maps."""
     placed = Placed(load(source(name)), seed)
     make = {"sphere": _from_sphere, "decimated": _decimated, "sub-pixel": _sub_pixel}[name]
-    case = make(placed.reference, placed.sampler, seed)
+    case = make(placed.subject, seed)
     for group in range(case.pool.capacity // case.pool.batch):
         case.pool.draw(group)
     return case
 
 
-def _validation(reference: MeshReference, sampler: ViewSampler) -> Validation:
-    return Validation(reference, sampler.held_out(VALIDATION).draw(0, VALIDATION_VIEWS), LOOKED_AT)
+def _validation(subject: Subject) -> Validation:
+    views = subject.sampler.held_out(VALIDATION).draw(0, VALIDATION_VIEWS)
+    return Validation(subject.reference, views, LOOKED_AT)
 
 
-def _from_sphere(reference: MeshReference, sampler: ViewSampler, seed: int) -> Case:
+def _from_sphere(subject: Subject, seed: int) -> Case:
     """A sphere of 4,212 triangles becomes spot, with the preconditioned steps of
     ``stages.growth``."""
-    mesh = growth.first_shape(1404, sampler, growth.TEXTURE)
+    mesh = growth.first_shape(1404, subject.sampler, growth.TEXTURE)
     maps = random_maps(growth.TEXTURE, seed, True)
 
     def make() -> Model:
@@ -80,8 +81,8 @@ def _from_sphere(reference: MeshReference, sampler: ViewSampler, seed: int) -> C
         return model
 
     pool = ReferencePool(
-        reference,
-        sampler,
+        subject.reference,
+        subject.sampler,
         growth.POOL,
         growth.VIEWS,
         growth.RESOLUTION,
@@ -89,24 +90,23 @@ def _from_sphere(reference: MeshReference, sampler: ViewSampler, seed: int) -> C
         growth.POINT_WIDTH,
     )
     options = FitOptions(laplacian=0.0, decay=1.0, seed=seed)
-    return Case("sphere", make, pool, _validation(reference, sampler), options)
+    return Case("sphere", make, pool, _validation(subject), options)
 
 
-def _decimated(reference: MeshReference, sampler: ViewSampler, seed: int) -> Case:
+def _decimated(subject: Subject, seed: int) -> Case:
     """flight_helmet with 1,367 triangles, 4 views of 256^2 pixels: the usual fit."""
-    return _from_mesh("decimated", reference, sampler, seed, 1367, 256, 4, None)
+    return _from_mesh("decimated", subject, seed, 1367, 256, 4, None)
 
 
-def _sub_pixel(reference: MeshReference, sampler: ViewSampler, seed: int) -> Case:
+def _sub_pixel(subject: Subject, seed: int) -> Case:
     """flight_helmet with 9,000 triangles on 64^2 pixels: smaller than a pixel each. Bent by waves
     of 2 % of the object's radius, for a good start has no shape to find."""
-    return _from_mesh("sub-pixel", reference, sampler, seed, 9000, 64, 16, 0.02)
+    return _from_mesh("sub-pixel", subject, seed, 9000, 64, 16, 0.02)
 
 
 def _from_mesh(
     name: str,
-    reference: MeshReference,
-    sampler: ViewSampler,
+    subject: Subject,
     seed: int,
     triangles: int,
     resolution: int,
@@ -114,13 +114,19 @@ def _from_mesh(
     bend: float | None,
 ) -> Case:
     options = simplify_options("default", triangles=triangles, texture_size=TEXTURE, reallocate=0)
-    start = make_start(reference, options, sampler, triangles)
+    start = make_start(subject, options, triangles)
     if bend is not None:
         start = _bent(start, bend)
     pool = ReferencePool(
-        reference, sampler, 320, views, resolution, POOL_SAMPLES, point_width(resolution, TEXTURE)
+        subject.reference,
+        subject.sampler,
+        320,
+        views,
+        resolution,
+        POOL_SAMPLES,
+        point_width(resolution, TEXTURE),
     )
-    validation = _validation(reference, sampler)
+    validation = _validation(subject)
 
     def fresh(rates: Rates) -> Model:
         return Model(start.mesh, start.maps, frozenset(("shape", "normal", "material")), rates)

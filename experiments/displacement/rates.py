@@ -48,7 +48,7 @@ class Bench:
         options = simplify_options(
             triangles=TRIANGLES, displacement=True, subdivision=(LEVEL,), reallocate=0
         )
-        self.start = make_start(reference, options, sampler, TRIANGLES)
+        self.start = make_start(placed.subject, options, TRIANGLES)
         width = point_width(RESOLUTION, options.texture_size)
         self.pool = ReferencePool(reference, sampler, POOL, options.views, RESOLUTION, 16, width)
         self.validation = Validation(reference, sampler.held_out(VALIDATION).draw(0, 8), HELD_OUT)

@@ -19,7 +19,13 @@ from appearance_opt.initial.atlas import unwrap
 from appearance_opt.initial.sphere import random_maps
 from appearance_opt.stages import growth
 from appearance_opt.stages.displacement import gutter
-from appearance_opt.stages.start import Start, budget, make_start, transfer_appearance
+from appearance_opt.stages.start import (
+    Start,
+    budget,
+    make_start,
+    require_survey,
+    transfer_appearance,
+)
 from appearance_opt.views import MEASURED
 from experiments import common
 from experiments.common import Placed, source_of
@@ -79,7 +85,7 @@ class Bench:
     def __init__(self, subject: Subject) -> None:
         self.subject, self._path = subject, subject.path()
         placed = Placed(load(self._path))
-        self.placement, self.asset = placed.placement, placed.asset
+        self.placed, self.placement, self.asset = placed.subject, placed.placement, placed.asset
         self.reference, self.sampler = placed.reference, placed.sampler
         self._views = self.sampler.held_out(MEASURED).draw(0, VIEWS)
         self._starts: dict[int, Start] = {}
@@ -136,13 +142,13 @@ class Bench:
         def make() -> tuple[Start, bool]:
             if texture == first:
                 count = budget(options, self.asset.triangle_count)
-                return make_start(self.reference, options, self.sampler, count), False
+                return make_start(self.placed, options, count), False
             mesh = self.start(first).mesh  # the same triangles in another atlas
             other = simplify_options(
                 "default", ratio=self.subject.ratio, steps=0, texture_size=texture
             )
             atlas = unwrap(mesh.positions, mesh.faces, texture, gutter(len(mesh.faces), other))
-            return transfer_appearance(self.reference, atlas, other), False
+            return transfer_appearance(require_survey(self.placed), atlas, other), False
 
         key = hashlib.sha256(
             json.dumps(as_dict(options), sort_keys=True).encode() + self._path.read_bytes()
