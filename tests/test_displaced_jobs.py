@@ -24,7 +24,8 @@ from appearance_opt.fit.model import POSITIONS, TEXELS, Model, Rates
 from appearance_opt.fit.validation import Validation
 from appearance_opt.initial.sphere import sphere
 from appearance_opt.jobs.joint import joint
-from appearance_opt.jobs.simplify import SimplifyResult, simplify
+from appearance_opt.jobs.result import SimplifyResult
+from appearance_opt.jobs.simplify import simplify
 from appearance_opt.latent.displacement import DISPLACEMENT, Tessellator, footprint
 from appearance_opt.latent.subdivision import tessellate
 from appearance_opt.latent.texels import TexelCodec

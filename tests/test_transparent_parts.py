@@ -193,10 +193,10 @@ def test_what_is_aligned_is_aligned_whole(snow_globe: Asset) -> None:
     for mesh, name in zip(job.high.meshes, ("ball", "shell", "sticker"), strict=True):
         expected = next(m for m in snow_globe.meshes if m.name == name)
         np.testing.assert_allclose(mesh.positions, expected.positions, atol=2e-3)
-    sampler, placement = job.view_of_all()
-    assert placement.scale > 1.04  # the label, at 1.05, is in the picture
+    shown = job.shown()
+    assert shown.placement.scale > 1.04  # the label, at 1.05, is in the picture
     assert job.placement.scale < 0.6
-    assert sampler.hull is not None
+    assert shown.sampler.hull is not None
 
 
 def test_resuming_knows_what_stays(snow_globe: Asset) -> None:

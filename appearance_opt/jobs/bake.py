@@ -4,7 +4,7 @@ coordinates."""
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,6 +16,7 @@ from appearance_opt.asset.alpha import seen_through
 from appearance_opt.errors import DivergedError, InputError
 from appearance_opt.interrupts import Interrupts
 from appearance_opt.jobs.paths import Outputs
+from appearance_opt.jobs.result import BakeResult
 from appearance_opt.placement import Placement
 from appearance_opt.publish import Publication, publication
 from appearance_opt.stages.parts import split
@@ -29,38 +30,15 @@ if TYPE_CHECKING:
     from appearance_opt.baking.closed_form import BakedMaps
     from appearance_opt.baking.target_mesh import Low
     from appearance_opt.config import BakeOptions
-    from appearance_opt.fit.loop import FitResult, Progress
+    from appearance_opt.fit.loop import Progress
+    from appearance_opt.reference.subject import Subject
     from appearance_opt.stages.fitting import Stopwatch
     from appearance_opt.stages.parts import Parts
-    from appearance_opt.views import ViewSampler
 
 log = logging.getLogger(__name__)
 
 MISSED_NOTE, MISSED_ERROR = 0.01, 0.5
 """Shares of missed texels from which on the user is told, and the bake is refused."""
-
-
-@dataclass
-class BakeResult:
-    """What ``bake`` did. ``asset``: LOW with the maps; ``closed_form``: the same before the fit;
-    ``fit``: None without one; ``maps``: channel name -> (size, size), lengths in metres;
-    ``covered``, ``missed``: texels of charts, and those whose rays found nothing; ``reach``: how
-    far rays went, metres; ``seconds`` by stage."""
-
-    asset: Asset
-    closed_form: Asset
-    fit: FitResult | None
-    maps: dict[str, NDArray[np.float32]]
-    covered: NDArray[np.bool_]
-    missed: NDArray[np.bool_]
-    reach: float
-    seconds: dict[str, float] = field(default_factory=dict)
-    notes: list[str] = field(default_factory=list)
-
-    @property
-    def missed_share(self) -> float:
-        """Fraction of the covered texels whose rays found nothing."""
-        return float(self.missed.sum() / max(int(self.covered.sum()), 1))
 
 
 def bake(
@@ -124,10 +102,10 @@ def _bake(
         raise error
 
     def write_report() -> None:
-        from appearance_opt.jobs.report import write_bake_report
+        from appearance_opt.jobs.report import write_job_report
 
         assert outputs.report is not None
-        write_bake_report(outputs.report, run.high, result, *run.view_of_all(), options)
+        write_job_report(outputs.report, result, run.shown(), options)
 
     conclude(result, watch, None if outputs.report is None else write_report)
     return result
@@ -235,24 +213,25 @@ class BakeJob:
         )
         return placed, replace(high_parts, fitted=placed, kept=kept).whole
 
-    def view_of_all(self) -> tuple[ViewSampler, Placement]:
-        """(sampler, placement) of views for a report, which shows transparent parts, too."""
+    def shown(self) -> Subject:
+        """What a report compares with: all of HIGH, in views that show transparent parts, too."""
+        from appearance_opt.reference.subject import Subject
         from appearance_opt.views import views_around
 
         low = self.low_parts.whole
         if not any(map(seen_through, (*self.high.meshes, *low.meshes))):
-            return self.subject.sampler, self.placement
+            return self.subject
         points = np.concatenate([self.high.points(), low.points()])
-        placement = Placement.around(points)
-        return views_around(
-            placement.to_local(points), self.options.seed, self.options.light
-        ), placement
+        placement, o = Placement.around(points), self.options
+        sampler = views_around(placement.to_local(points), o.seed, o.light)
+        return replace(Subject.of_asset(self.high, placement=placement), sampler=sampler)
 
     def run(
         self, progress: Progress | None, with_report: bool
     ) -> tuple[BakeResult, DivergedError | None]:
         """The closed form, and the fit that starts from it."""
         from appearance_opt.baking.closed_form import bake as bake_closed_form
+        from appearance_opt.baking.encode import coverage_picture
         from appearance_opt.stages.fitting import fit_start
         from appearance_opt.stages.start import Start, select_told
 
@@ -261,15 +240,23 @@ class BakeJob:
         self.check_missed(baked)
         self.watch.lap("closed form")
         closed = self._result(baked.maps)
+        reach, missed = baked.reach * self.placement.scale, 100 * baked.missed_share
+        count = closed.triangle_count
         result = BakeResult(
             closed,
-            closed,
-            None,
-            self._in_metres(baked.maps),
-            baked.covered,
-            baked.missed,
-            baked.reach * self.placement.scale,
+            {"closed form": closed},
+            title=f"{self.high.name} baked to {closed.name}",
+            facts={
+                "triangles": f"{count} of {self.high.triangle_count}",
+                "missed texels": f"{missed:.3f} % of {int(baked.covered.sum())}",
+                "reach of the rays (m)": f"{reach:.6g}",
+            },
+            pictures={"coverage (red: missed)": coverage_picture(baked.covered, baked.missed)},
             notes=self.notes,
+            maps=self._in_metres(baked.maps),
+            covered=baked.covered,
+            missed=baked.missed,
+            reach=reach,
         )
         parts = self._fitted_parts()
         if not parts:
@@ -295,6 +282,7 @@ class BakeJob:
         # would undo that
         maps = {**baked.maps, **model.host_maps()}
         result.fit, result.asset, result.maps = fitted, self._result(maps), self._in_metres(maps)
+        result.columns["fitted"] = result.asset
         self.notes += fitted.notes()
         self.watch.lap("export")
         return result, error

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 
 from appearance_opt.interrupts import Interrupts
 from appearance_opt.jobs.paths import Outputs
-from appearance_opt.jobs.simplify import SimplifyResult, write_result
+from appearance_opt.jobs.result import SimplifyResult
+from appearance_opt.jobs.simplify import write_result
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -76,10 +77,10 @@ def _fit_pair(
         raise result.error
 
     def write_report() -> None:
-        from appearance_opt.jobs.report import write_simplify_report
+        from appearance_opt.jobs.report import write_job_report
 
         assert outputs.report is not None
-        write_simplify_report(outputs.report, job.high, result, *job.view_of_all(), options)
+        write_job_report(outputs.report, result, job.shown(), options)
 
     conclude(result, watch, None if outputs.report is None else write_report)
     return result
@@ -131,16 +132,23 @@ def _fit_job(
     if options.wants("emission"):
         final |= transfer_emission(job.survey, model.posed_mesh(), options.texture_size)
     final = flatten_maps(model, final, start, job.subject.reference, job.subject.sampler, options)
+    tessellated = {k: with_kept(a) for k, a in exporter.drawn(model, final).items()}
+    before, after = len(job.survey.triangles.faces), len(mesh.faces)
     result = SimplifyResult(
         with_kept(exporter.base(model, final)),
-        with_kept(exporter.drawn(initial, start.maps)[initial.level]),
-        fitted,
-        len(mesh.faces),
-        len(job.survey.triangles.faces),
+        {
+            "start": with_kept(exporter.drawn(initial, start.maps)[initial.level]),
+            **{f"level {k}": a for k, a in tessellated.items()},
+        },
+        title=f"{job.high.name}: {before:,} to {after:,} triangles",
+        facts={"triangles": f"{after} of {before}"},
         notes=[*job.notes, *fitted.notes()],
         error=error,
-        tessellated={k: with_kept(a) for k, a in exporter.drawn(model, final).items()},
+        fit=fitted,
+        triangles=after,
+        source_triangles=before,
         kept_triangles=job.low_parts.kept_triangles,
+        tessellated=tessellated,
     )
     job.watch.lap("export")
     return result

@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from appearance_opt import backend
-from appearance_opt.baking.encode import coverage_picture
 from appearance_opt.config import as_dict
 from appearance_opt.evaluate import pictures
 from appearance_opt.evaluate.comparison import Comparison, render_asset
 from appearance_opt.evaluate.metrics import compare_images
 from appearance_opt.evaluate.report import ReportData, write_report
 from appearance_opt.reference.mesh import MeshReference
+from appearance_opt.reference.pool import check_images
 from appearance_opt.render.rays import MISS, trace
 from appearance_opt.views import MEASURED, Views
 
@@ -22,129 +22,48 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from appearance_opt.asset.types import Asset
-    from appearance_opt.config import BakeOptions, CommonOptions
-    from appearance_opt.evaluate.metrics import Metrics
-    from appearance_opt.jobs.bake import BakeResult
-    from appearance_opt.jobs.simplify import SimplifyResult
-    from appearance_opt.placement import Placement
-    from appearance_opt.views import ViewSampler
+    from appearance_opt.config import CommonOptions
+    from appearance_opt.jobs.result import Result
+    from appearance_opt.reference.subject import Subject
 
 VIEWS, RESOLUTION, SAMPLES = 8, 384, 9
 PICTURED = 4
 
 
-def write_simplify_report(
-    folder: Path,
-    source: Asset,
-    result: SimplifyResult,
-    sampler: ViewSampler,
-    placement: Placement,
-    options: CommonOptions,
+def write_job_report(
+    folder: Path, result: Result, subject: Subject, options: CommonOptions
 ) -> None:
-    """Report of a simplification: start and result against the source."""
-    names = ("start", f"level {max(result.tessellated)}" if result.tessellated else "result")
-    metrics, per_view = _measure(source, result.start, result.shown, names, sampler, placement)
-    metrics.update(_level_metrics(source, result, sampler, placement))
-    data = ReportData(
-        title=f"{source.name}: {result.source_triangles:,} to {result.triangles:,} triangles",
-        facts=_facts(result, options),
-        metrics=metrics,
-        views=per_view,
-        maps=pictures.texture_pictures(result.asset),
-        curve=[(p.seconds, p.step, p.psnr, p.loss) for p in result.fit.curve],
-        notes=result.notes,
-    )
-    write_report(folder, data)
-
-
-def _level_metrics(
-    source: Asset, result: SimplifyResult, sampler: ViewSampler, placement: Placement
-) -> dict[str, Metrics]:
-    """The coarser tessellation levels on the same views."""
-    if len(result.tessellated) < 2:
-        return {}
-    views = sampler.held_out(MEASURED).draw(0, VIEWS)
-    reference = render_asset(placement.local(source), views, RESOLUTION, SAMPLES)
-    return {
-        f"level {k}": compare_images(
-            reference, render_asset(placement.local(a), views, RESOLUTION, SAMPLES)
-        )
-        for k, a in sorted(result.tessellated.items())[:-1]
-    }
-
-
-def write_bake_report(
-    folder: Path,
-    high: Asset,
-    result: BakeResult,
-    sampler: ViewSampler,
-    placement: Placement,
-    options: BakeOptions,
-) -> None:
-    """Report of a bake: closed form and fit against HIGH (as it was aligned)."""
-    names = ("closed form", "fitted" if result.fit is not None else "result")
-    metrics, per_view = _measure(high, result.closed_form, result.asset, names, sampler, placement)
-    fit = result.fit
-    facts: dict[str, object] = {
-        "triangles": f"{result.asset.triangle_count} of {high.triangle_count}",
-        "missed texels": f"{100 * result.missed_share:.3f} % of {int(result.covered.sum())}",
-        "reach of the rays (m)": f"{result.reach:.6g}",
-        "seconds by stage": ", ".join(f"{k} {v:.1f}" for k, v in result.seconds.items()),
-    }
-    if fit is not None:
-        facts["steps"] = (
-            f"{fit.steps} ({fit.steps / max(fit.seconds, 1e-9):.1f} per second), best at {fit.best_step}"
-        )
-    maps = pictures.texture_pictures(result.asset)
-    maps["coverage (red: missed)"] = coverage_picture(result.covered, result.missed)
-    data = ReportData(
-        title=f"{high.name} baked to {result.asset.name}",
-        facts={**facts, **_settings(options)},
-        metrics=metrics,
-        views=per_view,
-        maps=maps,
-        curve=[] if fit is None else [(p.seconds, p.step, p.psnr, p.loss) for p in fit.curve],
-        notes=result.notes,
-    )
-    write_report(folder, data)
-
-
-def _measure(
-    source: Asset,
-    start: Asset,
-    result: Asset,
-    names: tuple[str, str],
-    sampler: ViewSampler,
-    placement: Placement,
-) -> tuple[dict[str, Metrics], list[dict[str, NDArray[np.uint8]]]]:
-    """(metrics of start and result, which ``names`` names, on held-out views of the source;
-    pictures of some of the views). One column is left out if the two are the same."""
-    views = sampler.held_out(MEASURED).draw(0, VIEWS)
-    reference, last = (
-        render_asset(placement.local(a), views, RESOLUTION, SAMPLES) for a in (source, result)
-    )
-    first = (
-        last
-        if start is result
-        else render_asset(placement.local(start), views, RESOLUTION, SAMPLES)
-    )
-    triangles = triangle_images(placement.local(result), views[:PICTURED], 2 * RESOLUTION)
-    metrics = {names[0]: compare_images(reference, first)}
-    if start is not result:
-        metrics[names[1]] = compare_images(reference, last)
+    """Report of a job: what it started from and what came of it, against images of ``subject``."""
+    views = subject.sampler.held_out(MEASURED).draw(0, VIEWS)
+    drawn = subject.reference.render(views, RESOLUTION, SAMPLES)
+    reference = check_images(drawn, VIEWS, RESOLUTION, "views of the report")
+    local = {name: subject.placement.local(a) for name, a in result.columns.items()}
+    images = {n: render_asset(a, views, RESOLUTION, SAMPLES) for n, a in local.items()}
+    first, *_, last = [*images, *images]  # one and the same where nothing was fitted
+    wires = triangle_images(local[last], views[:PICTURED], 2 * RESOLUTION)
     per_view = []
-    for r, s, a, t in zip(reference, first, last, triangles, strict=False):
+    for r, s, a, t in zip(reference, images[first], images[last], wires, strict=False):
         shown = {
             "reference": pictures.picture(r),
             "result": pictures.picture(a),
             "difference x 4": pictures.difference(r, a),
             "wireframe": pictures.wireframe(a, t),
         }
-        if start is not result:
-            shown[names[0]] = pictures.picture(s)
-            shown[f"{names[0]}'s difference x 4"] = pictures.difference(r, s)
+        if first != last:
+            shown[first] = pictures.picture(s)
+            shown[f"{first}'s difference x 4"] = pictures.difference(r, s)
         per_view.append(shown)
-    return metrics, per_view
+    curve = [] if result.fit is None else result.fit.curve
+    data = ReportData(
+        title=result.title,
+        facts=_facts(result, options),
+        metrics={name: compare_images(reference, image) for name, image in images.items()},
+        views=per_view,
+        maps={**pictures.texture_pictures(result.asset), **result.pictures},
+        curve=[(p.seconds, p.step, p.psnr, p.loss) for p in curve],
+        notes=result.notes,
+    )
+    write_report(folder, data)
 
 
 def write_compare_report(
@@ -185,21 +104,13 @@ def triangle_images(asset: Asset, views: Views, resolution: int) -> NDArray[np.i
     return np.stack(out)
 
 
-def _facts(result: SimplifyResult, options: CommonOptions) -> dict[str, object]:
-    fit = result.fit
-    facts: dict[str, object] = {
-        "triangles": f"{result.triangles} of {result.source_triangles}",
-        "steps": f"{fit.steps} ({fit.steps / max(fit.seconds, 1e-9):.1f} per second), best at {fit.best_step}",
-        "skipped steps": fit.skipped,
-        "triangles turned back": fit.unfolded,
-        "seconds by stage": ", ".join(f"{k} {v:.1f}" for k, v in result.seconds.items()),
-    }
-    return {**facts, **_settings(options)}
-
-
-def _settings(options: CommonOptions) -> dict[str, object]:
-    facts: dict[str, object] = {
-        f"option {k.replace('_', ' ')}": v for k, v in as_dict(options).items() if v is not None
-    }
-    facts.update({f"version of {k}": v for k, v in backend.versions().items()})
-    return facts
+def _facts(result: Result, options: CommonOptions) -> dict[str, object]:
+    facts, fit = dict(result.facts), result.fit
+    if fit is not None:
+        speed = fit.steps / max(fit.seconds, 1e-9)
+        facts["steps"] = f"{fit.steps} ({speed:.1f} per second), best at {fit.best_step}"
+        facts |= {"skipped steps": fit.skipped, "triangles turned back": fit.unfolded}
+    facts["seconds by stage"] = ", ".join(f"{k} {v:.1f}" for k, v in result.seconds.items())
+    given = {k: v for k, v in as_dict(options).items() if v is not None}
+    facts |= {f"option {k.replace('_', ' ')}": v for k, v in given.items()}
+    return {**facts, **{f"version of {k}": v for k, v in backend.versions().items()}}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,20 +11,20 @@ from appearance_opt import __version__, backend
 from appearance_opt.asset import load, write
 from appearance_opt.config import CommonOptions, SimplifyOptions, with_values
 from appearance_opt.digest import digest
-from appearance_opt.errors import DivergedError, InputError
+from appearance_opt.errors import InputError
 from appearance_opt.interrupts import Interrupts
 from appearance_opt.jobs.paths import Outputs, level_path
-from appearance_opt.placement import Placement
+from appearance_opt.jobs.result import SimplifyResult
 from appearance_opt.publish import publication
+from appearance_opt.reference.subject import Subject
 from appearance_opt.stages.parts import split
-from appearance_opt.views import views_around
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
     from appearance_opt.asset.types import Asset
     from appearance_opt.fit.checkpoint import Checkpointer
-    from appearance_opt.fit.loop import FitResult, Progress
+    from appearance_opt.fit.loop import Progress
     from appearance_opt.stages.fitting import Stopwatch
     from appearance_opt.stages.growth import Effort
     from appearance_opt.stages.parts import Parts
@@ -33,33 +33,6 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 CHECKPOINT_SECONDS = 10.0
-
-
-@dataclass
-class SimplifyResult:
-    """What ``simplify`` did. ``asset``: the result, whose first mesh was fitted (the first two
-    where some faces are seen from one side and others from both); the others passed through: they
-    have ``kept_triangles``, which ``triangles`` and ``source_triangles`` do not count. ``start``:
-    the same before the fit; ``tessellated``: with a displacement map, the mesh as drawn at each
-    level (and ``start`` at the finest one); ``fit``: curve and counts; ``seconds``: wall-clock time
-    by stage; ``notes``: what the user should know; ``error``: set when the fit diverged
-    (``simplify`` raises it after writing the best state)."""
-
-    asset: Asset
-    start: Asset
-    fit: FitResult
-    triangles: int
-    source_triangles: int
-    seconds: dict[str, float] = field(default_factory=dict)
-    notes: list[str] = field(default_factory=list)
-    error: DivergedError | None = None
-    tessellated: dict[int, Asset] = field(default_factory=dict)
-    kept_triangles: int = 0
-
-    @property
-    def shown(self) -> Asset:
-        """What is to be looked at: the finest tessellated mesh, or the result itself."""
-        return self.tessellated[max(self.tessellated)] if self.tessellated else self.asset
 
 
 def simplify(
@@ -140,20 +113,17 @@ def _simplify(
     interrupts.release()
     if result.error is not None:
         raise result.error
-    placement, sampler = run.subject.placement, run.subject.sampler
+    subject = run.subject
     if parts.kept:  # they may lie outside of what the fit's views show
-        points = parts.whole.points()
-        placement = Placement.around(points)
-        sampler = views_around(placement.to_local(points), options.seed, options.light)
+        subject = Subject.of_asset(parts.whole, options.seed, options.light)
     del run
 
     def write_report() -> None:
-        from appearance_opt.jobs.report import write_simplify_report
+        from appearance_opt.jobs.report import write_job_report
 
-        # the report uploads what it draws: a heavy reference need not be held twice
         backend.release_memory()
         assert outputs.report is not None
-        write_simplify_report(outputs.report, parts.whole, result, sampler, placement, options)
+        write_job_report(outputs.report, result, subject, options)
 
     conclude(result, watch, None if outputs.report is None else write_report)
     return result
@@ -210,7 +180,6 @@ class _Job:
         interrupts: Interrupts,
         with_report: bool,
     ) -> None:
-        from appearance_opt.reference.subject import Subject
         from appearance_opt.stages.fitting import seconds_left
         from appearance_opt.stages.growth import grow_start, mend_start
         from appearance_opt.stages.start import (
@@ -334,16 +303,21 @@ class _Job:
         result = exporter.base(model, maps)
         tessellated = exporter.drawn(model, maps) if o.displaced else {}
         self.watch.lap("export")
+        with_kept, triangles = self.parts.with_kept, len(self.start.mesh.faces)
+        tessellated = {k: with_kept(a) for k, a in tessellated.items()}
+        last = {f"level {k}": a for k, a in tessellated.items()} or {"result": with_kept(result)}
         return SimplifyResult(
-            self.parts.with_kept(result),
-            self.parts.with_kept(begin),
-            fitted,
-            len(self.start.mesh.faces),
-            asset.triangle_count,
+            with_kept(result),
+            {"start": with_kept(begin), **last},
+            title=f"{asset.name}: {asset.triangle_count:,} to {triangles:,} triangles",
+            facts={"triangles": f"{triangles} of {asset.triangle_count}"},
+            fit=fitted,
             notes=[*self.notes, *self.start.notes, *fitted.notes()],
             error=error,
-            tessellated={k: self.parts.with_kept(a) for k, a in tessellated.items()},
+            triangles=triangles,
+            source_triangles=asset.triangle_count,
             kept_triangles=self.parts.kept_triangles,
+            tessellated=tessellated,
         )
 
 

@@ -1,0 +1,86 @@
+"""What jobs hand back, and all that a report knows of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from appearance_opt.asset.types import Asset
+    from appearance_opt.errors import DivergedError
+    from appearance_opt.fit.loop import FitResult
+
+
+@dataclass
+class Result:
+    """What a job did.
+
+    ``asset``: the result as it is written. ``columns``: by name, what a report shows beside the
+    source, the start first and what came of it last. ``fit``: curve and counts, None without one.
+    ``title`` of a report, ``facts`` that it lists by name, ``pictures`` (H, W, 3) that it shows
+    beside those of the maps. ``notes``: what the user should know, a line each. ``seconds``:
+    wall-clock time by stage. ``error``: set when the fit diverged (jobs raise it after the best
+    state is written).
+    """
+
+    asset: Asset
+    columns: dict[str, Asset]
+    fit: FitResult | None = None
+    title: str = ""
+    facts: dict[str, object] = field(default_factory=dict)
+    pictures: dict[str, NDArray[np.uint8]] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+    seconds: dict[str, float] = field(default_factory=dict)
+    error: DivergedError | None = None
+
+    @property
+    def start(self) -> Asset:
+        """The same before the fit."""
+        return next(iter(self.columns.values()))
+
+    @property
+    def shown(self) -> Asset:
+        """What is to be looked at: with a displacement map, the finest tessellated mesh."""
+        return list(self.columns.values())[-1]
+
+
+@dataclass
+class SimplifyResult(Result):
+    """What a job did that fits a mesh (``simplify``, ``joint``, ``fit``).
+
+    The first mesh of ``asset`` was fitted (the first two where some faces are seen from one side
+    and others from both); the others passed through: they have ``kept_triangles``, which
+    ``triangles`` and ``source_triangles`` do not count. ``tessellated``: with a displacement map,
+    the mesh as drawn at each level (and ``start`` at the finest one).
+    """
+
+    fit: FitResult = field(kw_only=True)
+    triangles: int = field(kw_only=True)
+    source_triangles: int = field(kw_only=True)
+    kept_triangles: int = 0
+    tessellated: dict[int, Asset] = field(default_factory=dict)
+
+
+@dataclass
+class BakeResult(Result):
+    """What ``bake`` did. ``asset``: LOW with the maps. ``maps``: channel name -> (size, size),
+    lengths in metres; ``covered``, ``missed``: texels of charts, and those whose rays found
+    nothing; ``reach``: how far rays went, metres."""
+
+    maps: dict[str, NDArray[np.float32]] = field(kw_only=True)
+    covered: NDArray[np.bool_] = field(kw_only=True)
+    missed: NDArray[np.bool_] = field(kw_only=True)
+    reach: float = field(kw_only=True)
+
+    @property
+    def closed_form(self) -> Asset:
+        """LOW with the maps before the fit."""
+        return self.start
+
+    @property
+    def missed_share(self) -> float:
+        """Fraction of the covered texels whose rays found nothing."""
+        return float(self.missed.sum() / max(int(self.covered.sum()), 1))
