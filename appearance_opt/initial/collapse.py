@@ -10,10 +10,9 @@ from numpy.typing import NDArray
 from appearance_opt.initial.edges import touching
 from appearance_opt.initial.stacks import without_copies
 
-MINIMUM_COSINE = -0.6
-"""A collapse may not turn the normal of a face it keeps by more than the angle of this cosine. Thin
-parts need a loose bound: with 0.2 it forbids all cheap collapses there (flight_helmet loses 2
-dB)."""
+MINIMUM_COSINE = -0.6  # docs/trials.md: decimation
+"""A collapse may not turn the normal of a face it keeps by more than the angle of this cosine: thin
+parts need a loose bound."""
 
 STRICT, TURNING, TEARING = range(3)
 """What a collapse may do when nothing better is left: turn faces over, then change the topology,

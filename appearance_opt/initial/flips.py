@@ -10,16 +10,13 @@ from appearance_opt.asset.normals import unit
 from appearance_opt.initial import quadrics
 from appearance_opt.initial.edges import keys, sides_of, touching
 
-FLAT = 0.002
+FLAT = 0.002  # docs/trials.md: decimation
 """How far apart the two diagonals of four corners may lie for their edge to be flipped, in units of
-the square root of the area between them. With 0.02 flight_helmet's start at 1.5 % lost 1 dB: in
-long thin faces that is as much as they are wide."""
+the square root of the area between them."""
 
-THIN = 0.5
+THIN = 0.5  # docs/trials.md: decimation
 """How far apart they may lie where the new one is no farther from the original surface, in units of
-the least height of the four triangles. Without this bound, and with errors that may grow by the
-price of a collapse, chess_king's start at
-1.5 % loses 0.3 dB; docs/trials.md: decimation."""
+the least height of the four triangles."""
 
 POOR = 0.3
 """Quality below which a triangle is to be made better: others stay as the decimation chose them."""
@@ -28,8 +25,8 @@ GAIN = 1.1
 """How many times better the worse of the two triangles must get: from fans to strips it takes many
 small steps."""
 
-ROUNDS = 30
-"""At most. Each flip makes the worse triangle of two better; measured: 3 to 12 rounds."""
+ROUNDS = 30  # docs/trials.md: decimation
+"""At most: each flip makes the worse triangle of two better, so that few are needed."""
 
 
 def quality(a: NDArray, b: NDArray, c: NDArray) -> NDArray[np.float64]:

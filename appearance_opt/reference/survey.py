@@ -112,7 +112,7 @@ class Survey(Protocol):
 
         "nearest": the nearest one in either direction. "outermost": the first one met from the cage
         inward, as most bakers do it; it picks up neighbouring layers wherever parts lie close
-        together (it costs 2 to 4 dB on such assets), but sees parts that float above the surface.
+        together, but sees parts that float above the surface (docs/trials.md: transfer).
         """
         ...
 

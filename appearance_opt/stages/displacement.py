@@ -38,23 +38,21 @@ FILLED = 0.6
 
 MAX_GUTTER = 16
 
-SAMPLES = 4
-"""Rays per texel of the closed-form displacement. Hits on walls that are steep to the ray are kept:
-leaving them out costs 0.9 dB on chess_king, whose rims are such walls."""
+SAMPLES = 4  # docs/trials.md: displacement
+"""Rays per texel of the closed-form displacement. Hits on walls that are steep to the ray are kept."""
 
 REACH = 0.5
 """How far a decimated mesh is displaced at most, in its own median edges: farther away lies another
 part."""
 
-AROUND, OUTLIER = 5, 0.5
+AROUND, OUTLIER = 5, 0.5  # docs/trials.md: displacement
 """A displacement that differs from the median of a square of ``AROUND`` texels by more than
 ``OUTLIER`` tessellated edges is a ray that met another part, where surfaces lie close together; the
-median takes its place. On chess_king these are 0.3 % of the texels, and with ``REACH`` the start
-gains 2.2 dB."""
+median takes its place."""
 
 BYTES_PER_TRIANGLE = 700
-"""Memory of a fit for each tessellated triangle, all levels together. Measured 500 to 550 on two
-threads (docs/displacement.md); gradients have a copy for each thread."""
+"""Memory of a fit for each tessellated triangle, all levels together (docs/displacement.md);
+gradients have a copy for each thread."""
 
 BYTES_AT_LEAST = 1 << 29
 """What a job takes apart from that: libraries, kernels, maps, images."""

@@ -180,30 +180,21 @@ def point_width(resolution: int, texture_size: int) -> float:
     return float(np.clip(1.25 * resolution / texture_size, 0.4, 2.0))
 
 
-GROWN_RATE = 0.032
-"""Learning rates from a grown shape, which is rough however well it does: after 65 seconds with
-half, once, twice, four and eight times 0.008 spot (28 dB at the start) ends at 30.0, 30.9, 32.4,
-33.5 and 33.4 dB and chess_king in grey (25 dB) at 27.5, 28.7, 28.8, 29.1 and 28.3."""
+GROWN_RATE = 0.032  # docs/trials.md: rates
+"""Learning rates from a grown shape, which is rough however well it does."""
 
 
-LEAST_RATE_SHARE = 0.25
+LEAST_RATE_SHARE = 0.25  # docs/trials.md: rates
 """Least share of the rates for starts that are better than 35 dB: what is left there is finer than
 what the views of a fit show."""
 
-LEAST_VERTEX_SHARE = 0.3
+LEAST_VERTEX_SHARE = 0.3  # docs/trials.md: rates
 """Least share of the rate of vertices, on top of that, for starts that are better than 34 dB: a
-vertex that moves turns the bumps of the normal map around it. After 600 steps, in the eyes of
-another renderer, chess_king at 8,104 triangles (37 dB), which starts at 37.2 to 37.5 dB, ends 0.6
-dB below its start with half of all rates, 0.2 below with this share of the vertices' as well, and
-level with it with both least shares; spot at 4,684 (41 dB), which starts at 41.4, ends at
-43.04 and 42.97 with the first two. At 2,432 triangles (34.6 dB) chess_king gains 0.23 dB by a third of the vertices'
-rate, at 1,404 (33.4 dB) spot loses 0.23."""
+vertex that moves turns the bumps of the normal map around it."""
 
 
-LONG = (600, 40.0)
-"""Steps or seconds of a fit that is long enough for the least rates. In a draft, of some 150 steps,
-they gain nothing: spot at 4,684 triangles ended at 41.46 dB with a quarter of the rates, at 42.06
-with half of them."""
+LONG = (600, 40.0)  # docs/trials.md: rates
+"""Steps or seconds of a fit that is long enough for the least rates."""
 
 
 def patience(options: CommonOptions, watch: Stopwatch, with_report: bool) -> float:

@@ -62,13 +62,10 @@ radius."""
 
 RATES = Rates(normal=0.01, base_color=0.02, material=0.01)
 
-POSITION_RATE = 0.12
+POSITION_RATE = 0.12  # docs/trials.md: spheres
 """Rate of the positions for smoothing of strength 1, in units of the object's radius:
 preconditioned steps know no edge length. It grows with the square root of the strength, for the
-largest gradient sets the step of all vertices, and more smoothing takes more off it. What is right
-depends on the size: after 200 steps of 9,000 triangles (strength 6) from an ellipsoid, chess_king
-in grey is at 18.7, 23.7 and 24.5 dB with rates of 0.1, 0.2 and 0.4; 42 steps of 600 triangles
-(strength 0.4) towards an egg lead to 27.0, 25.0 and 22.3 dB with the same ones."""
+largest gradient sets the step of all vertices, and more smoothing takes more off it."""
 
 MENDING = 0.5
 """Rate for a mesh that is spoilt, not unknown, in units of that of a sphere: it has less far to

@@ -38,12 +38,9 @@ NOISE = 12 * STEP
 """Deviation from their mean up to which maps may be noise (99 % of the texels): pictures decide.
 What varies more is drawn for no such question."""
 
-LOSS = 0.03
+LOSS = 0.03  # docs/trials.md: constant-maps
 """dB that a result may lose, in the eyes of held-out views, by the colours of something that has
-one colour becoming a number. A grey ball of 1,000 triangles (33.7 dB after 120 steps, 512 texels)
-loses 0.0075 by those of its base colour,
-0.001 and 0.004 by those of roughness and metalness, although single pixels change by up to 6, 2 and 2 steps (99 % of
-them by 1.3, 0.4 and 0.4)."""
+one colour becoming a number."""
 
 VIEWS, SAMPLES = 8, 9
 

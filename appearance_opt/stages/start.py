@@ -50,25 +50,21 @@ log = logging.getLogger(__name__)
 
 VISIBILITY_VIEWS = 160
 
-REALLOCATION_SHARE = 0.4
-"""Part of the time left after the first start that moving triangles may take. Where steps are slow
-they are worth more: on a machine at a third of its usual speed the demo's urn ended at 23.79 dB
-with a round, which took 28 of the 47 seconds left, and at 24.26 without."""
+REALLOCATION_SHARE = 0.4  # docs/trials.md: reallocation
+"""Part of the time left after the first start that moving triangles may take."""
 
-REALLOCATION_EXTRA = 1.5
+REALLOCATION_EXTRA = 1.5  # docs/trials.md: reallocation
 """What moving triangles takes apart from its rounds, in first starts: images of the reference, and
-the spread of the texels. 1.4 for the demo's urn and chess_king."""
+the spread of the texels."""
 
-WORTHWHILE = 0.98
+WORTHWHILE = 0.98  # docs/trials.md: reallocation
 """Error of a start with moved triangles, relative to the one before, up to which it takes its
-place. What is gained by less lies within chance: starts of spot and chess_king at 1.5 % with an
-error 1.6 % smaller were 0.25 and 0.54 dB worse in the eyes of another renderer; one of chess_king
-at 5 % with an error 2.3 % smaller was 0.54 dB better."""
+place."""
 
-SECONDS_PER_FACE, COARSE_SHARE = 2e-5, 0.25
-"""What decimation takes per face of the reference (1.4e-5 on a machine of today, more on others),
-and the part of a time budget from which it begins with a coarse round (see ``clustering``). The
-same on every machine, so that the same options make the same start."""
+SECONDS_PER_FACE, COARSE_SHARE = 2e-5, 0.25  # docs/trials.md: decimation
+"""What decimation takes per face of the reference, and the part of a time budget from which it
+begins with a coarse round (see ``clustering``). The same on every machine, so that the same options
+make the same start."""
 
 CLUSTERS, LEAST_CLUSTERS = 40, 100_000
 """Vertices that a coarse round leaves, per triangle that is asked for, and at the least."""
