@@ -12,8 +12,10 @@ import pytest
 from appearance_opt.asset.tangents import split_and_tangents
 from appearance_opt.fit.model import Model, Rates
 from appearance_opt.initial.sphere import sphere
-from appearance_opt.render import coverage, deferred, gradient, rays
-from appearance_opt.render.pixels import Grid
+from appearance_opt.render import coverage, gradient
+from appearance_opt.render.images import render_image
+from appearance_opt.render.lattice import sub_pixel_offsets
+from appearance_opt.render.pixels import Batch, Grid
 from appearance_opt.render.quality import Quality
 from appearance_opt.views import ViewSampler
 from experiments.accuracy import physics, stages, textures
@@ -21,11 +23,12 @@ from experiments.gradient_error.estimators import Ours
 from experiments.gradient_error.metrics import error_of
 from experiments.gradient_error.problems import make_problem, smooth_fields
 from tests.differences import differences_along
+from tests.drawing import drawn_of
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 4, 7, 8, 16, 64, 256])
 def test_ray_positions_are_centred_and_apart(count: int) -> None:
-    points = rays.sub_pixel_offsets(count).astype(np.float64)
+    points = sub_pixel_offsets(count).astype(np.float64)
     assert points.min() > 0 and points.max() < 1
     # an off-centre pattern shifts the image; float32 rounding of the mean alone is left
     np.testing.assert_allclose(points.mean(0), 0.5, atol=1e-7)
@@ -55,15 +58,13 @@ def test_silhouettes_know_the_coverage_of_their_pixels() -> None:
     constants = {"red": 0.6, "green": 0.3, "blue": 0.2, "roughness": 0.5, "metalness": 0.2}
     model = Model(mesh, constants, frozenset(("shape",)), Rates())
     grid, records = Grid(2, 64), ViewSampler((0.0, 0.0, 0.0), 1.0, seed=5).draw(0, 2).records()
-    surface, maps = model.surface(model.positions()), model.maps(None)
+    drawn, batch = drawn_of(model), Batch(records, grid)
     quality = Quality(4.0, 4, 1)
     with dr.suspend_grad():
-        batch = gradient.render(
-            model.scene, surface, maps, model.topology.edges, records, grid, quality, 0
-        )
-        exact = deferred.render_image(model.scene, surface, maps, records, grid, 1024)
-    crossed = np.unique(np.array(batch.edges.pixel))
-    error = (np.array(batch.image) - np.array(exact)).reshape(-1, 4)[crossed, 3]
+        rendered = gradient.render(drawn, batch, quality, 0)
+        exact = render_image(drawn, batch, 1024)
+    crossed = np.unique(np.array(rendered.edges.pixel))
+    error = (np.array(rendered.image) - np.array(exact)).reshape(-1, 4)[crossed, 3]
     # measured 0.022; by the same four rays alone 0.095
     assert np.sqrt(np.mean(error**2)) < 0.05
     # measured 8e-4: no shift of the outline

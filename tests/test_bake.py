@@ -30,10 +30,11 @@ from appearance_opt.latent.mesh import LatentMesh
 from appearance_opt.reference.curvature import mean_curvature
 from appearance_opt.reference.mesh import MeshReference
 from appearance_opt.reference.survey import MeshSurvey
-from appearance_opt.render.deferred import render_image
-from appearance_opt.render.pixels import Grid
+from appearance_opt.render.images import render_image
+from appearance_opt.render.pixels import Batch, Grid
 from appearance_opt.views import ViewSampler
 from scenes.analytic import sphere_mesh
+from tests.drawing import drawn_of
 from tests.test_cli import run
 
 SIZE = 64
@@ -268,14 +269,7 @@ def test_a_latent_with_its_own_normals_is_drawn_as_the_asset() -> None:
     maps.update({f"normal_{a}": n[..., k] for k, a in enumerate("xyz")})
     model = Model(low.mesh, maps, frozenset(["normal"]), Rates())
     views = ViewSampler((0.0, 0.0, 0.0), 0.9).draw(0, 3)
-    ours = render_image(
-        model.scene,
-        model.surface(model.positions()),
-        model.maps(model.fitted_layer()),
-        views.records(),
-        Grid(3, 64),
-        4,
-    )
+    ours = render_image(drawn_of(model), Batch(views.records(), Grid(3, 64)), 4)
     theirs = MeshReference(low.asset).render(views, 64, 4)
     # the same data through two paths: texels are clamped and stored once more (measured 70 dB)
     assert compare_images(theirs, np.array(ours).reshape(theirs.shape)).psnr > 55

@@ -22,10 +22,12 @@ from appearance_opt.latent.laplacian import Laplacian
 from appearance_opt.latent.mesh import LatentMesh, LatentTopology, local_edge_length
 from appearance_opt.latent.texels import TexelCodec
 from appearance_opt.reference.pool import Targets
-from appearance_opt.render import deferred, gradient
-from appearance_opt.render.pixels import Grid
+from appearance_opt.render import gradient
+from appearance_opt.render.images import render_image
+from appearance_opt.render.pixels import Batch, Grid
 from appearance_opt.render.quality import Quality
 from appearance_opt.views import ViewSampler
+from tests.drawing import drawn_of
 
 SAMPLER = ViewSampler((0.0, 0.0, 0.0), 1.0, seed=5)
 
@@ -134,25 +136,17 @@ def coverage_derivative(density: float, samples: int) -> tuple[float, float]:
     start = np.array(model.positions())
     positions = mi.Float(start)
     dr.enable_grad(positions)
-    surface = model.surface(positions)
-    maps = model.maps(model.fitted_layer())
-    quality = Quality(density, samples, 1)
-    batch = gradient.render(
-        model.scene, surface, maps, model.topology.edges, records, grid, quality, 0
-    )
+    drawn, batch = drawn_of(model, positions), Batch(records, grid)
+    rendered = gradient.render(drawn, batch, Quality(density, samples, 1), 0)
     by_image = np.zeros((grid.pixels, 4), np.float32)
     by_image[:, 3] = 1
-    gradient.backward(
-        gradient.surrogate(batch, surface, maps, model.topology.edges, mi.Float(by_image.ravel()))
-    )
+    gradient.backward(gradient.surrogate(rendered, drawn, mi.Float(by_image.ravel())))
     edge = float(np.array(dr.grad(positions)).astype(np.float64) @ start)
     areas = []
     for scale in (1.02, 0.98):
         model.parameters[POSITIONS].value = mi.Float(start * scale)
         model.update_scene()
-        image = deferred.render_image(
-            model.scene, model.surface(model.positions()), maps, records, grid, 64
-        )
+        image = render_image(drawn_of(model), batch, 64)
         areas.append(float(np.array(image).reshape(-1, 4)[:, 3].sum()))
     return edge, (areas[0] - areas[1]) / 0.04
 
@@ -331,17 +325,16 @@ def test_pixels_shaded_with_their_loss_have_the_gradient_of_the_whole_image(
     inputs = replace(make_inputs(model, grid, 1), want_loss=want_loss)
     loss = LOSSES["log-srgb-l1"]
     value, quick = Gradients(model, grid, quality, loss, freeze=False)(inputs)
-    records, layer = inputs.views.records(), model.fitted_layer()
+    layer = model.fitted_layer()
     assert layer is not None and model.codec is not None
     shape, layer = model.track(model.shape(), layer)
-    surface = model.surface(model.drawn.pose(shape))
-    maps, edges = model.maps(layer), model.topology.edges
-    batch = gradient.render(model.scene, surface, maps, edges, records, grid, quality, inputs.seed)
-    assert batch.deferred is None
+    drawn = replace(drawn_of(model, model.drawn.pose(shape)), maps=model.maps(layer))
+    rendered = gradient.render(drawn, Batch(inputs.views.records(), grid), quality, inputs.seed)
+    assert rendered.deferred is None
     target = Target.of(inputs.reference.average, inputs.background)
-    pixels = compared_pixels(batch.image, target)
-    whole, by_image = image_loss(loss, target, batch.image, pixels, grid.pixels)
-    gradient.backward(gradient.surrogate(batch, surface, maps, edges, by_image))
+    pixels = compared_pixels(rendered.image, target)
+    whole, by_image = image_loss(loss, target, rendered.image, pixels, grid.pixels)
+    gradient.backward(gradient.surrogate(rendered, drawn, by_image))
     slow = model.gradients(shape, layer, model.values())
     assert (value is not None) == want_loss
     if value is not None:

@@ -18,11 +18,12 @@ from appearance_opt.latent.export import to_asset
 from appearance_opt.latent.mesh import LatentMesh
 from appearance_opt.reference.mesh import MeshReference
 from appearance_opt.reference.pool import Targets
-from appearance_opt.render.deferred import render_image
-from appearance_opt.render.pixels import Grid
+from appearance_opt.render.images import render_image
+from appearance_opt.render.pixels import Batch, Grid
 from appearance_opt.render.quality import Quality
 from appearance_opt.views import Views, ViewSampler, look_at
 from tests.conftest import grid_sphere, make_asset
+from tests.drawing import drawn_of
 
 SAMPLER = ViewSampler((0.0, 0.0, 0.0), 1.0, seed=5)
 CHANNELS = {
@@ -73,8 +74,7 @@ def check(
     background = np.full((len(views), 3), 0.4, np.float32)
     inputs = StepInputs(views, Targets(mi.Float(target.ravel())), background, 0.0, 1.0, 3)
     value, grads = Gradients(model, grid, quality, LOSSES[loss], freeze=False)(inputs)
-    surface, maps = model.surface(model.positions()), model.maps(model.fitted_layer())
-    image = np.array(render_image(model.scene, surface, maps, views.records(), grid, 4))
+    image = np.array(render_image(drawn_of(model), Batch(views.records(), grid), 4))
     assert np.isfinite(image).all() and (image >= 0).all()
     assert np.isfinite(float(value[0]))
     host = {n: np.array(g) for n, g in grads.items()}
@@ -223,10 +223,8 @@ def test_a_highlight_of_the_smoothest_metal(loss: str) -> None:
     )
     assert image[12, 12, 0] > 1e5  # measured 2.4e5, the mean of four samples around the highlight
     model = model_of(latent(TRIANGLE, [[0, 1, 2]]), roughness=0.0, metalness=1.0, normal_x=0.0)
-    surface, maps = model.surface(model.positions()), model.maps(model.fitted_layer())
-    middle = np.array(
-        render_image(model.scene, surface, maps, views.records(), Grid(1, 25), 1)
-    ).reshape(25, 25, 4)
+    image = render_image(drawn_of(model), Batch(views.records(), Grid(1, 25)), 1)
+    middle = np.array(image).reshape(25, 25, 4)
     # F D V E with alpha = 0.08^2
     assert middle[12, 12, 0] == pytest.approx(0.6 / (np.pi * 0.08**4) / 4 * 2e4 / 9, rel=1e-4)
 
@@ -351,10 +349,8 @@ def test_pixel_centres_on_edges_and_vertices_are_covered_once() -> None:
     for quality in (EDGES, PAIRS):
         check(mesh, views, n, quality=quality)
     model = model_of(mesh)
-    surface, maps = model.surface(model.positions()), model.maps(model.fitted_layer())
-    image = np.array(
-        render_image(model.scene, surface, maps, views.records(), Grid(1, n), 1)
-    ).reshape(n, n, 4)
+    drawn = render_image(drawn_of(model), Batch(views.records(), Grid(1, n)), 1)
+    image = np.array(drawn).reshape(n, n, 4)
     assert (image[1:-1, 1:-1, 3] == 1).all()  # those on the border may fall to either side
     assert set(np.unique(image[..., 3])) <= {0.0, 1.0}
 

@@ -13,7 +13,7 @@ from appearance_opt.asset.types import Asset, Material, Mesh, Texture
 from appearance_opt.errors import InputError
 from appearance_opt.evaluate.metrics import compare_images
 from appearance_opt.reference.mesh import MeshReference
-from appearance_opt.render import layers
+from appearance_opt.render import images, layers
 from appearance_opt.views import Views, look_at
 from tests.conftest import grid_sphere
 
@@ -158,10 +158,9 @@ def test_layers_end(monkeypatch: pytest.MonkeyPatch, empty: int) -> None:
     assert got[16, 16, 3] == (1 if empty < 5 else 0)
 
 
-def test_opaque_assets_pay_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(layers, "render_image", None)
+def test_opaque_assets_pay_nothing() -> None:
     reference = MeshReference(Asset((card(0, Material("wall", opacity=0.5)),)))
-    assert reference.coverage is None
+    assert reference.coverage is None and reference._renderer is images
     assert reference.render(front(), 32, 4)[0, 16, 16, 3] == 1
 
 

@@ -16,18 +16,20 @@ from appearance_opt.fit.model import POSITIONS, Model, Rates
 from appearance_opt.fit.step import Gradients
 from appearance_opt.initial.sphere import sphere
 from appearance_opt.latent.mesh import LatentMesh
-from appearance_opt.render import deferred, gradient, silhouette_walk
+from appearance_opt.render import gradient, silhouette_walk
+from appearance_opt.render.drawn import Drawn
+from appearance_opt.render.edge_list import edge_list, walkable
 from appearance_opt.render.gradient import RenderedBatch
-from appearance_opt.render.pixels import Grid
+from appearance_opt.render.images import render_image
+from appearance_opt.render.pixels import Batch, Grid
 from appearance_opt.render.quality import Quality
-from appearance_opt.render.silhouette import edge_list, walkable
-from appearance_opt.render.surface import Surface
 from appearance_opt.views import Views, ViewSampler
 from experiments.gradient_error.area import ball
 from experiments.gradient_error.estimators import Ours
 from experiments.gradient_error.metrics import error_of
 from experiments.gradient_error.problems import make_problem
 from tests.differences import differences_along
+from tests.drawing import drawn_of
 from tests.test_gradients import flat_maps, make_inputs, make_model
 
 SAMPLER = ViewSampler((0.0, 0.0, 0.0), 1.0, seed=5)
@@ -46,27 +48,22 @@ def two_balls() -> LatentMesh:
     return LatentMesh(p, f, np.arange(len(p), dtype=np.int32), f, np.zeros((len(p), 2), np.float32))
 
 
-def drawn(
+def render(
     model: Model, views: Views, grid: Grid, quality: Quality
-) -> tuple[RenderedBatch, Surface, mi.Float]:
-    """(batch, surface, positions that track gradients)."""
+) -> tuple[RenderedBatch, Drawn, mi.Float]:
+    """(rendered batch, what is drawn, positions that track gradients)."""
     positions = mi.Float(np.array(model.positions()))
     dr.enable_grad(positions)
-    surface = model.surface(positions)
-    maps = model.maps(model.fitted_layer())
-    batch = gradient.render(
-        model.scene, surface, maps, model.topology.walkable, views.records(), grid, quality, 0
-    )
-    return batch, surface, positions
+    drawn = drawn_of(model, positions, walkable=True)
+    return gradient.render(drawn, Batch(views.records(), grid), quality, 0), drawn, positions
 
 
 def pulled(
-    model: Model, batch: RenderedBatch, surface: Surface, positions: mi.Float, by_image: np.ndarray
+    rendered: RenderedBatch, drawn: Drawn, positions: mi.Float, by_image: np.ndarray
 ) -> np.ndarray:
     """dLoss/dPositions, for dLoss/dImage (pixels, 4)."""
-    maps, edges = model.maps(model.fitted_layer()), model.topology.walkable
     flat = mi.Float(by_image.astype(np.float32).ravel())
-    gradient.backward(gradient.surrogate(batch, surface, maps, edges, flat))
+    gradient.backward(gradient.surrogate(rendered, drawn, flat))
     return np.array(dr.grad(positions)).reshape(-1, 3).astype(np.float64)
 
 
@@ -104,12 +101,12 @@ def test_the_gradient_is_that_of_the_blended_image(
     start = mesh.positions.astype(np.float64)
     rng = np.random.default_rng(0)
     by = rng.normal(size=(grid.pixels, 4))  # every pixel has its own weight: none hides the others
-    analytic = pulled(model, *drawn(model, views, grid, quality), by)
+    analytic = pulled(*render(model, views, grid, quality), by)
     fields = rng.normal(size=(16, 1, 3)) + 0.3 * rng.normal(size=(16, len(start), 3))
     met: list[list[bytes]] = []
 
     def image() -> np.ndarray:
-        batch, _, _ = drawn(model, views, grid, quality)
+        batch, _, _ = render(model, views, grid, quality)
         assert batch.edges is not None and batch.averaged is not None
         assert (batch.intersections is None) == (balls == 1)
         curve = batch.intersections
@@ -136,16 +133,13 @@ def test_pairs_carry_the_derivative_of_the_covered_area(
     model, grid, views = white(mesh), Grid(4, 64), SAMPLER.draw(1, 4)
     by = np.zeros((grid.pixels, 4))
     by[:, 3] = 1
-    batch, surface, positions = drawn(model, views, grid, replace(PAIRS, samples=samples))
+    rendered = render(model, views, grid, replace(PAIRS, samples=samples))
     start = mesh.positions.astype(np.float64)
-    found = np.sum(pulled(model, batch, surface, positions, by) * start)
-    records, maps = views.records(), model.maps(model.fitted_layer())
+    found = np.sum(pulled(*rendered, by) * start)
+    batch = Batch(views.records(), grid)
 
     def image() -> np.ndarray:
-        here = model.surface(model.positions())
-        return np.array(deferred.render_image(model.scene, here, maps, records, grid, 64)).reshape(
-            -1, 4
-        )
+        return np.array(render_image(drawn_of(model), batch, 64)).reshape(-1, 4)
 
     numeric = differences(model, start, start[None], 0.02, image, by)[0]
     # measured +0.3 %; -1.6 % with triangles as small as pixels; +0.04 % with 2 x 2 samples in a
@@ -158,9 +152,9 @@ def test_a_walk_finds_silhouettes_beyond_the_triangle_that_is_seen(
 ) -> None:
     """Why we walk: without, fine meshes lose most of their outline."""
     model, grid, views = white(ball(0)), Grid(2, 64), SAMPLER.draw(1, 2)
-    every, _, _ = drawn(model, views, grid, PAIRS)
+    every, _, _ = render(model, views, grid, PAIRS)
     monkeypatch.setattr(silhouette_walk, "LONGEST", 1)
-    near, _, _ = drawn(model, views, grid, PAIRS)
+    near, _, _ = render(model, views, grid, PAIRS)
     assert every.edges is not None and near.edges is not None
     assert dr.width(near.edges.edge) < 0.5 * dr.width(every.edges.edge)
 
@@ -228,7 +222,7 @@ def test_pairs_that_see_nothing_are_no_pairs() -> None:
         mesh.positions + np.float32(100), mesh.faces, mesh.frame_vertex, mesh.frame_faces, mesh.uvs
     )
     model, grid = white(away), Grid(2, 32)
-    batch, _, _ = drawn(model, SAMPLER.draw(0, 2), grid, PAIRS)
+    batch, _, _ = render(model, SAMPLER.draw(0, 2), grid, PAIRS)
     assert batch.edges is None and batch.averaged is None
     assert not np.array(batch.image).any()
 

@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 
 from appearance_opt.initial.sphere import sphere
 from appearance_opt.render import raster, rays, upload
-from appearance_opt.render.pixels import Grid
-from appearance_opt.render.rays import MISS
+from appearance_opt.render.passing import MISS
+from appearance_opt.render.pixels import Batch, Grid
+from appearance_opt.render.surface import Surface
 from appearance_opt.views import Views, ViewSampler, look_at
 from scenes.analytic import bumpy_sphere
 
@@ -22,9 +23,9 @@ def drawn(
 ) -> tuple[NDArray, NDArray]:
     """(triangle, depth) of all pixels, in the order of ``Grid``."""
     g = Grid(len(views), n)
-    mesh = upload.packets(8, p), upload.index_packets(f), views.records()
-    at = g.view, g.column, g.row, mi.Float(dx), mi.Float(dy), g.size, g.rows
-    samples, depth = raster.visible(*mesh, *at, g.views, g.pixels)
+    surface = Surface(upload.index_packets(f), upload.packets(8, p))
+    batch = Batch(views.records(), g)
+    samples, depth = raster.draw_grid(surface, batch, mi.Float(dx), mi.Float(dy))
     np.testing.assert_array_equal(np.array(samples.x), np.array(g.column) + np.float32(dx))
     np.testing.assert_array_equal(np.array(samples.y), np.array(g.row) + np.float32(dy))
     return np.array(samples.triangle), np.array(depth)
@@ -33,9 +34,8 @@ def drawn(
 def traced(
     p: NDArray, f: NDArray, views: Views, n: int, dx: float = 0.5, dy: float = 0.5
 ) -> tuple[NDArray, NDArray]:
-    g = Grid(len(views), n)
-    at = mi.Float(g.column) + dx, mi.Float(g.row) + dy
-    samples, depth = rays.trace_depth(upload.scene_of(p, f), views.records(), g.view, *at, g.size)
+    batch = Batch(views.records(), Grid(len(views), n))
+    samples, depth = rays.trace_grid(upload.scene_of(p, f), batch, dx, dy)
     return np.array(samples.triangle), np.array(depth)
 
 

@@ -17,7 +17,8 @@ from appearance_opt.placement import Placement
 from appearance_opt.reference.mesh import MeshReference
 from appearance_opt.render import rays, texture, upload
 from appearance_opt.render.math import angle_of
-from appearance_opt.render.pixels import Grid
+from appearance_opt.render.passing import MISS
+from appearance_opt.render.pixels import Batch, Grid
 from appearance_opt.render.texture import CLAMP, MIRROR, REPEAT, Base, build_pyramid
 from appearance_opt.views import ViewSampler, look_at
 from experiments import mitsuba_peer
@@ -209,7 +210,7 @@ def test_a_pair_is_the_image_at_outlines_and_points_elsewhere(ball: Asset) -> No
     average, points = reference.pair(views, 192, 16, 0.4)
     full, single = (
         reference.render(views, 192, 16),
-        reference.render_device(views.records(), Grid(2, 192), 1, 0.4),
+        reference.render_device(Batch(views.records(), Grid(2, 192)), 1, 0.4),
     )
     np.testing.assert_array_equal(points, np.array(single).reshape(points.shape))
     outline = (full[..., 3] > 0) & (full[..., 3] < 1)
@@ -239,11 +240,10 @@ def test_a_moved_scene_shows_what_a_new_one_does() -> None:
         np.float32
     )
     moving = upload.MovingScene(mesh.positions, mesh.faces)
-    records = ViewSampler((0.0, 0.0, 0.0), 1.0, seed=4).draw(0, 2).records()
+    batch = Batch(ViewSampler((0.0, 0.0, 0.0), 1.0, seed=4).draw(0, 2).records(), grid)
 
     def seen(scene: mi.Scene) -> tuple[np.ndarray, np.ndarray]:
-        at = mi.Float(grid.column) + 0.5, mi.Float(grid.row) + 0.5
-        hits, depth = rays.trace_depth(scene, records, grid.view, *at, grid.size)
+        hits, depth = rays.trace_grid(scene, batch)
         return np.array(hits.triangle), np.array(depth)
 
     for positions in (mesh.positions, moved):
@@ -252,7 +252,7 @@ def test_a_moved_scene_shows_what_a_new_one_does() -> None:
             seen(moving.scene),
             seen(upload.scene_of(positions, mesh.faces)),
         )
-        assert (expected != rays.MISS).sum() > 500
+        assert (expected != MISS).sum() > 500
         # on an edge between two triangles either may be met
         assert (triangle == expected).mean() > 0.999
         np.testing.assert_allclose(depth, there, rtol=1e-5)

@@ -17,7 +17,8 @@ from appearance_opt.baking.occlusion import exposed
 from appearance_opt.initial.sphere import sphere
 from appearance_opt.render import raster, rays, upload
 from appearance_opt.render.passing import MISS, SidedScene, blocked, meet
-from appearance_opt.render.pixels import Grid
+from appearance_opt.render.pixels import Batch, Grid
+from appearance_opt.render.surface import Surface
 from appearance_opt.views import Views, ViewSampler
 
 SAMPLER = ViewSampler((0.0, 0.0, 0.0), 1.0, seed=3)
@@ -49,20 +50,11 @@ def seen(
     p: NDArray, f: NDArray, hidden: NDArray | None, views: Views, n: int = 64
 ) -> tuple[NDArray, NDArray]:
     """(views, pixels) triangles that rays meet, and that are drawn."""
-    g = Grid(len(views), n)
-    at = g.view, g.column, g.row
-    traced = rays.trace(
-        upload.scene_of(p, f, hidden),
-        views.records(),
-        g.view,
-        mi.Float(g.column) + 0.5,
-        mi.Float(g.row) + 0.5,
-        g.size,
-    )
-    half = mi.Float(0.5)
+    batch = Batch(views.records(), Grid(len(views), n))
+    traced, _ = rays.trace_grid(upload.scene_of(p, f, hidden), batch)
     mask = None if hidden is None else mi.Bool(hidden)
-    mesh = upload.packets(8, p), upload.index_packets(f), views.records()
-    drawn, _ = raster.visible(*mesh, *at, half, half, g.size, g.rows, g.views, g.pixels, mask)
+    surface = Surface(upload.index_packets(f), upload.packets(8, p), culled=mask)
+    drawn, _ = raster.draw_grid(surface, batch, mi.Float(0.5), mi.Float(0.5))
     return np.array(traced.triangle).reshape(len(views), -1), np.array(drawn.triangle).reshape(
         len(views), -1
     )
@@ -209,13 +201,11 @@ def test_scenes_without_backs_are_plain() -> None:
 
 def test_moving_sheets_turn_their_backs() -> None:
     p, f = sheet()
-    views = SAMPLER.draw(0, 4)
-    g = Grid(4, 32)
+    batch = Batch(SAMPLER.draw(0, 4).records(), Grid(4, 32))
     moving = upload.MovingScene(p, f, np.ones(len(f), bool))
-    at = g.view, mi.Float(g.column) + 0.5, mi.Float(g.row) + 0.5, g.size
 
     def shown() -> NDArray:
-        hit = np.array(rays.trace(moving.scene, views.records(), *at).triangle) != MISS
+        hit = np.array(rays.trace_grid(moving.scene, batch)[0].triangle) != MISS
         return hit.reshape(4, -1).any(axis=1)
 
     before = shown()

@@ -18,10 +18,12 @@ from appearance_opt.fit.model import POSITIONS, Model, Rates
 from appearance_opt.fit.step import Gradients
 from appearance_opt.initial.sphere import sphere
 from appearance_opt.latent.mesh import LatentMesh
-from appearance_opt.render import deferred, gradient
-from appearance_opt.render.pixels import Grid
+from appearance_opt.render import gradient
+from appearance_opt.render.images import render_image
+from appearance_opt.render.pixels import Batch, Grid
 from appearance_opt.render.quality import Quality
 from appearance_opt.views import ViewSampler
+from tests.drawing import drawn_of
 
 SAMPLER = ViewSampler((0.0, 0.0, 0.0), 1.0, seed=5)
 
@@ -65,20 +67,15 @@ def test_silhouettes_carry_the_derivative_of_the_area_that_is_seen_of_fronts(
     quality = (
         Quality(4.0, 8, 1) if visibility == "edges" else Quality(visibility="pairs", samples=4)
     )
-    edges = model.topology.walkable if quality.walks else model.topology.edges
     weight = np.repeat(np.random.default_rng(0).uniform(0.5, 1.5, 8), 64 * 64)
     start = np.array(model.positions())
     positions = mi.Float(start)
     dr.enable_grad(positions)
-    surface, maps, records = (
-        model.surface(positions),
-        model.maps(model.fitted_layer()),
-        views.records(),
-    )
-    batch = gradient.render(model.scene, surface, maps, edges, records, grid, quality, 0)
+    drawn, batch = drawn_of(model, positions, quality.walks), Batch(views.records(), grid)
+    rendered = gradient.render(drawn, batch, quality, 0)
     by = np.zeros((grid.pixels, 4), np.float32)
     by[:, 3] = weight
-    gradient.backward(gradient.surrogate(batch, surface, maps, edges, mi.Float(by.ravel())))
+    gradient.backward(gradient.surrogate(rendered, drawn, mi.Float(by.ravel())))
     analytic = np.array(dr.grad(positions)).astype(np.float64)
     rng = np.random.default_rng(1)
     # growing, moving and turning about, and what random vertices add to it
@@ -92,9 +89,7 @@ def test_silhouettes_carry_the_derivative_of_the_area_that_is_seen_of_fronts(
                 (start + step * field.ravel()).astype(np.float32)
             )
             model.update_scene()
-            image = deferred.render_image(
-                model.scene, model.surface(model.positions()), maps, records, grid, 64
-            )
+            image = render_image(drawn_of(model), batch, 64)
             area.append(float(np.array(image).reshape(-1, 4)[:, 3].astype(np.float64) @ weight))
         numeric.append((area[0] - area[1]) / 0.02)
         predicted.append(float(analytic @ field.ravel()))

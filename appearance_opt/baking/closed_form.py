@@ -20,8 +20,8 @@ from appearance_opt.baking.occlusion import exposed, openness
 from appearance_opt.baking.reach import automatic_reach
 from appearance_opt.baking.texel_points import Points, TexelPoints
 from appearance_opt.initial.fill import fill
+from appearance_opt.render.lattice import sub_pixel_offsets
 from appearance_opt.render.passing import blocked
-from appearance_opt.render.rays import sub_pixel_offsets
 from appearance_opt.render.surface import face_normal
 
 if TYPE_CHECKING:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import drjit as dr
 import mitsuba as mi
 
-from appearance_opt.render.rays import sub_pixel_offsets
+from appearance_opt.render.lattice import sub_pixel_offsets
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -115,7 +115,7 @@ def render_environment(
     Roughness is widened by the size of the light's part of the sky, as if it shone from all of it
     (after Karis, "Real Shading in Unreal Engine 4", 2013, on area lights)."""
     from appearance_opt.reference.mesh import MeshReference
-    from appearance_opt.render.pixels import Grid
+    from appearance_opt.render.pixels import Batch, Grid
 
     count = len(lights.directions)
     reference = MeshReference(_widened(asset, (2 / count) ** 0.5 / 2))
@@ -130,7 +130,7 @@ def render_environment(
             light=np.broadcast_to(lamp.astype(np.float32), views.light.shape),
             intensity=np.full_like(views.intensity, intensity),
         )
-        image = reference.render_device(one.records(), grid, 1, 0.0)
+        image = reference.render_device(Batch(one.records(), grid), 1, 0.0)
         return np.array(image).reshape(shape).astype(np.float64)
 
     out = np.zeros(shape)

@@ -12,7 +12,9 @@ import numpy as np
 from appearance_opt.fit import adam
 from appearance_opt.fit.losses import Target, compared_pixels, covered_loss, image_loss
 from appearance_opt.render import gradient
+from appearance_opt.render.drawn import Drawn
 from appearance_opt.render.freezing import Frozen, traced
+from appearance_opt.render.pixels import Batch
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -87,34 +89,25 @@ class Gradients:
         """Mean image loss (width 1; None without ``want_loss``) and the gradient of every
         parameter."""
         model, grid, run = self.model, self.grid, self._run
-        records = inputs.views.records()
         target = Target.of(inputs.reference.average, inputs.background)
         stored = model.values()
         with dr.suspend_grad():
             shape, layer = run(self._unpacked, stored)
             surface = run(self._surface, model.level, shape)
-        edges = self._edges[model.level]
-        batch = gradient.render(
-            model.scene,
-            surface,
-            model.maps(layer),
-            edges,
-            records,
-            grid,
-            self.quality,
-            inputs.seed,
-            True,
-            run,
-        )
+        drawn = Drawn(model.scene, surface, model.maps(layer), self._edges[model.level])
+        batch = Batch(inputs.views.records(), grid)
+        rendered = gradient.render(drawn, batch, self.quality, inputs.seed, run, defer=True)
         # Only averaged pixels have a gradient here. Of one ray per pixel these are the crossed
         # ones; of several rays also those that are covered in part without being crossed. The value
         # of the loss needs all pixels.
-        some = batch.crossed
-        if inputs.want_loss or batch.deferred is None or self.quality.samples > 1:
-            some = compared_pixels(batch.image, target, batch.complete())
+        some = rendered.crossed
+        if inputs.want_loss or rendered.deferred is None or self.quality.samples > 1:
+            some = compared_pixels(rendered.image, target, rendered.complete())
         averaged, by_image = None, dr.zeros(mi.Float, 4 * grid.pixels)
         if some is not None and dr.width(some):
-            averaged, by_image = run(image_loss, self.loss, target, batch.image, some, grid.pixels)
+            averaged, by_image = run(
+                image_loss, self.loss, target, rendered.image, some, grid.pixels
+            )
         # what one ray saw is compared with one ray
         points = inputs.reference.points if self.quality.samples == 1 else None
         direct, out = run(
@@ -123,7 +116,8 @@ class Gradients:
             stored,
             shape,
             layer,
-            batch,
+            drawn,
+            rendered,
             by_image,
             target if points is None else replace(target, reference=points),
             dr.opaque(mi.Float, inputs.laplacian_weight),
@@ -153,7 +147,8 @@ class Gradients:
         stored: dict[str, mi.Float],
         shape: Shape,
         layer: TexelLayer | None,
-        batch: gradient.RenderedBatch,
+        drawn: Drawn,
+        rendered: gradient.RenderedBatch,
         by_image: mi.Float,
         target: Target,
         laplacian_weight: mi.Float,
@@ -161,16 +156,16 @@ class Gradients:
     ) -> tuple[mi.Float | None, dict[str, mi.Float]]:
         """(loss of the deferred pixels, gradient of every parameter). ``level``: as in
         ``_surface``."""
-        model, edges = self.model, self._edges[level]
+        model = self.model
         shape, layer = model.track(shape, layer)
         posed = model.drawn.pose(shape)
-        surface, maps = model.surface(posed), model.maps(layer)
+        drawn = replace(drawn, surface=model.surface(posed), maps=model.maps(layer))
 
         def pixel_loss(color: mi.Color3f, pixel: mi.UInt32) -> mi.Float:
             return covered_loss(self.loss, target, color, pixel)
 
-        terms = gradient.surrogate(batch, surface, maps, edges, by_image)
-        direct = gradient.direct(batch, surface, maps, pixel_loss)
+        terms = gradient.surrogate(rendered, drawn, by_image)
+        direct = gradient.direct(rendered, drawn, pixel_loss)
         if direct is not None:
             terms.append(direct)
         if dr.grad_enabled(posed) and level in self.laplacians:

@@ -8,9 +8,10 @@ import numpy as np
 
 from appearance_opt.errors import DivergedError
 from appearance_opt.reference.pool import check_images
-from appearance_opt.render.deferred import render_image
 from appearance_opt.render.display import display
-from appearance_opt.render.pixels import Grid
+from appearance_opt.render.drawn import Drawn
+from appearance_opt.render.images import render_image
+from appearance_opt.render.pixels import Batch, Grid
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -38,10 +39,8 @@ class Validation:
         """The model in the held-out views: (B, H, W, 4) premultiplied linear radiance and
         coverage."""
         surface = model.surface(model.posed())
-        maps = model.maps(model.fitted_layer())
-        image = render_image(
-            model.scene, surface, maps, self.views.records(), self._grid, self.samples
-        )
+        drawn = Drawn(model.scene, surface, model.maps(model.fitted_layer()))
+        image = render_image(drawn, Batch(self.views.records(), self._grid), self.samples)
         return np.array(image).reshape(len(self.views), self.resolution, self.resolution, 4)
 
     def psnr(self, model: Model) -> float:

@@ -8,20 +8,21 @@ costs more than others get more texels.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import drjit as dr
-import mitsuba as mi
 import numpy as np
 
 from appearance_opt.initial.atlas import charts_of, uv_areas
 from appearance_opt.latent.mesh import LatentTopology
 from appearance_opt.latent.texels import maps_of
 from appearance_opt.render import rays
-from appearance_opt.render.deferred import render_image
 from appearance_opt.render.display import display
-from appearance_opt.render.material import CHANNELS, MaterialMaps
-from appearance_opt.render.pixels import Grid
+from appearance_opt.render.images import render_image
+from appearance_opt.render.material import CHANNELS
+from appearance_opt.render.passing import MISS
+from appearance_opt.render.pixels import Batch, Grid
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from appearance_opt.latent.mesh import LatentMesh
+    from appearance_opt.render.drawn import Drawn
     from appearance_opt.views import ViewSampler
 
 BATCHES, BATCH, RESOLUTION, SAMPLES = 4, 8, 256, 4
@@ -65,36 +67,25 @@ def _loss_of_half(
 ) -> NDArray[np.float64]:
     """(F,) squared display error that maps at half the resolution make, over the pixels that show
     each face."""
-    topology = LatentTopology(mesh, tangents="normal_x" in maps)
-    scene = topology.scene()
-    surface = topology.surface(mi.Float(np.ascontiguousarray(mesh.positions, np.float32).ravel()))
+    drawn = LatentTopology(mesh, tangents="normal_x" in maps).drawn(maps_of(maps))
     half = {n: halve(np.asarray(v)) if np.ndim(v) and n in CHANNELS else v for n, v in maps.items()}
-    both = [maps_of(m) for m in (maps, half)]
+    both = drawn, replace(drawn, maps=maps_of(half))
     grid, out = Grid(BATCH, RESOLUTION), np.zeros(len(mesh.faces))
-    pixel = np.array((grid.view * grid.rows + grid.row) * grid.rows + grid.column)
+    pixel = np.array(grid.index)
     for k in range(BATCHES):
-        records = sampler.draw(k, BATCH).records()
-        fine, coarse = (display(_image(scene, surface, m, records, grid)) for m in both)
+        batch = Batch(sampler.draw(k, BATCH).records(), grid)
+        fine, coarse = (display(_image(d, batch)) for d in both)
         error = np.mean((fine - coarse) ** 2, axis=-1).ravel()
-        hits = rays.trace(
-            scene,
-            records,
-            grid.view,
-            mi.Float(grid.column) + 0.5,
-            mi.Float(grid.row) + 0.5,
-            grid.size,
-        )
-        face = np.array(hits.triangle)
-        seen = face != rays.MISS
+        face = np.array(rays.trace_grid(drawn.scene, batch)[0].triangle)
+        seen = face != MISS
         out += np.bincount(face[seen], error[pixel[seen]], len(out))
     return out
 
 
-def _image(
-    scene, surface, maps: MaterialMaps, records: mi.Float, grid: Grid
-) -> NDArray[np.float32]:
+def _image(drawn: Drawn, batch: Batch) -> NDArray[np.float32]:
     with dr.suspend_grad():
-        image = render_image(scene, surface, maps, records, grid, SAMPLES)
+        image = render_image(drawn, batch, SAMPLES)
+    grid = batch.grid
     return np.array(image).reshape(grid.views, grid.resolution, grid.resolution, 4)
 
 

@@ -20,9 +20,10 @@ from appearance_opt.initial.visibility import around, welded_areas
 from appearance_opt.latent.mesh import LatentTopology
 from appearance_opt.latent.texels import maps_of
 from appearance_opt.render import rays
-from appearance_opt.render.deferred import render_image
 from appearance_opt.render.display import display
-from appearance_opt.render.pixels import Grid
+from appearance_opt.render.images import render_image
+from appearance_opt.render.passing import MISS
+from appearance_opt.render.pixels import Batch, Grid
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -60,9 +61,9 @@ class StartError:
         views: int = VIEWS,
     ) -> None:
         self.triangles = triangles
-        self._grid = Grid(BATCH, RESOLUTION)
+        grid = Grid(BATCH, RESOLUTION)
         drawn = [sampler.draw(k, BATCH) for k in range(views // BATCH)]
-        self._records = [v.records() for v in drawn]
+        self._batches = [Batch(v.records(), grid) for v in drawn]
         self._images = [display(reference.render(v, RESOLUTION, SAMPLES)) for v in drawn]
 
     def measure(
@@ -71,38 +72,22 @@ class StartError:
         """(mean squared display error, its sum over the pixels that show each face of the reference
         (F,))."""
         total = dr.zeros(mi.UInt64, len(self.triangles.faces))
-        topology = LatentTopology(mesh, tangents=True)
-        scene = topology.scene()
-        layers = maps_of(maps)
-        surface = topology.surface(
-            mi.Float(np.ascontiguousarray(mesh.positions, np.float32).ravel())
-        )
+        drawn = LatentTopology(mesh, tangents=True).drawn(maps_of(maps))
         mean = 0.0
-        for records, expected in zip(self._records, self._images, strict=True):
-            image = self._display(
-                render_image(scene, surface, layers, records, self._grid, SAMPLES)
-            )
+        for batch, expected in zip(self._batches, self._images, strict=True):
+            image = self._display(render_image(drawn, batch, SAMPLES))
             error = np.mean((image - expected) ** 2, axis=-1)
-            mean += float(error.mean()) / len(self._records)
+            mean += float(error.mean()) / len(self._batches)
             # a pixel's neighbours answer for it, too: beside an outline the reference shows nothing
             # to blame
             spread = maximum_filter(error, size=(1, 3, 3))
-            self._collect(total, records, mi.Float(spread.ravel()))
+            self._collect(total, batch, mi.Float(spread.ravel()))
         return mean, np.array(total).astype(np.float64) / FIXED_POINT
 
-    def _collect(self, total: mi.UInt64, records: mi.Float, error: mi.Float) -> None:
-        g = self._grid
-        hits = rays.trace(
-            self.triangles.scene,
-            records,
-            g.view,
-            mi.Float(g.column) + 0.5,
-            mi.Float(g.row) + 0.5,
-            g.size,
-        )
-        seen = hits.triangle != rays.MISS
-        pixel = (g.view * g.rows + g.row) * g.rows + g.column
-        value = mi.UInt64(dr.gather(mi.Float, error, pixel) * FIXED_POINT)
+    def _collect(self, total: mi.UInt64, batch: Batch, error: mi.Float) -> None:
+        hits, _ = rays.trace_grid(self.triangles.scene, batch)
+        seen = hits.triangle != MISS
+        value = mi.UInt64(dr.gather(mi.Float, error, batch.grid.index) * FIXED_POINT)
         dr.scatter_reduce(dr.ReduceOp.Add, total, value, dr.select(seen, hits.triangle, 0), seen)
         dr.eval(total)
 

@@ -11,7 +11,8 @@ import numpy as np
 from appearance_opt.asset.normals import weld
 from appearance_opt.initial.stacks import coincident
 from appearance_opt.render import rays
-from appearance_opt.render.pixels import Grid
+from appearance_opt.render.passing import MISS
+from appearance_opt.render.pixels import Batch, Grid
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -39,16 +40,8 @@ def pixel_counts(
     total = dr.zeros(mi.UInt32, faces)
     grid = Grid(batch, resolution)
     for k in range(-(-views // batch)):
-        records = sampler.draw(k, batch).records()
-        hits = rays.trace(
-            scene,
-            records,
-            grid.view,
-            mi.Float(grid.column) + 0.5,
-            mi.Float(grid.row) + 0.5,
-            grid.size,
-        )
-        seen = hits.triangle != rays.MISS
+        hits, _ = rays.trace_grid(scene, Batch(sampler.draw(k, batch).records(), grid))
+        seen = hits.triangle != MISS
         dr.scatter_reduce(
             dr.ReduceOp.Add, total, mi.UInt32(1), dr.select(seen, hits.triangle, 0), seen
         )

@@ -15,12 +15,15 @@ from appearance_opt.asset.sides import culled
 from appearance_opt.latent import mesh_ops
 from appearance_opt.latent.mesh_ops import Corners
 from appearance_opt.render import upload
-from appearance_opt.render.silhouette import EdgeList, edge_list, walkable
+from appearance_opt.render.drawn import Drawn
+from appearance_opt.render.edge_list import EdgeList, edge_list, walkable
 from appearance_opt.render.surface import Surface
+from appearance_opt.render.upload import MeshArrays
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from appearance_opt.render.material import MaterialMaps
     from appearance_opt.render.passing import Scene
 
 
@@ -98,18 +101,19 @@ class LatentTopology:
         """The mesh where it was at first, for tracing rays."""
         return upload.scene_of(self.mesh.positions, self.mesh.faces, self.culled)
 
+    def drawn(self, maps: MaterialMaps) -> Drawn:
+        """The mesh where it was at first, ready to be drawn with ``maps``."""
+        positions = mi.Float(np.ascontiguousarray(self.mesh.positions, np.float32).ravel())
+        return Drawn(self.scene(), self.surface(positions), maps)
+
     def _fixed_surface(self) -> Surface:
         m = self.mesh
         assert m.normals is not None and m.tangents is not None
-        vertices = upload.packets(8, m.positions, np.zeros(len(m.positions)), m.normals)
-        frames = self.corners.uvs
-        if self.tangents:
-            frames = upload.packets(
-                8, m.uvs, m.tangents[:, 3], np.zeros(len(m.uvs)), m.tangents[:, :3]
-            )
-        return Surface(
-            self.faces, vertices, self.frame_faces, frames, None, self.tangents, self._culled
+        tangents = m.tangents if self.tangents else None
+        mesh = MeshArrays(
+            m.positions, m.normals, m.faces, m.uvs, tangents, m.frame_faces, culled=self.culled
         )
+        return upload.surface_of(mesh)
 
 
 def weld_faces(positions: NDArray, faces: NDArray) -> NDArray[np.intp]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import drjit as dr
@@ -14,11 +14,13 @@ from appearance_opt.asset.batch import Batch, fill_normals, replace_chosen
 from appearance_opt.asset.sides import culled, single_sided
 from appearance_opt.asset.tangents import any_tangent, split_and_tangents
 from appearance_opt.reference.textures import coverage_maps, emission_maps, material_maps
-from appearance_opt.render import deferred, layers, upload
+from appearance_opt.render import images, pixels
+from appearance_opt.render.drawn import Drawn
 from appearance_opt.render.freezing import Frozen
-from appearance_opt.render.material import UNLIT
-from appearance_opt.render.pixels import Grid
+from appearance_opt.render.layers import SeenThrough
+from appearance_opt.render.material import UNLIT, MaterialMaps
 from appearance_opt.render.surface import Surface
+from appearance_opt.render.upload import MeshArrays
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -26,44 +28,30 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from appearance_opt.asset.types import Asset, Mesh
+    from appearance_opt.render.images import Renderer
+    from appearance_opt.render.passing import Scene
     from appearance_opt.views import Views
 
 MAX_PIXELS = 1 << 20
 """Pixels rendered at once: more saves no time and costs memory."""
 
 
-@dataclass(frozen=True)
-class MergedMesh:
-    """All meshes of an asset as one, vertices split where attributes differ. See
-    ``asset.types.Mesh``; ``colors`` (V, 4) have alpha. ``material``: (F,) index into the asset's
-    materials, in the order of its meshes."""
-
-    positions: NDArray[np.float32]
-    normals: NDArray[np.float32]
-    uvs: NDArray[np.float32]
-    tangents: NDArray[np.float32] | None
-    colors: NDArray[np.float32] | None
-    faces: NDArray[np.int32]
-    material: NDArray[np.int32]
-
-
 class MeshReference:
     """Renders an asset. ``survey.MeshSurvey`` answers what its surface looks like.
 
     ``merged``: the host arrays; ``single`` (F,): faces that are seen from their front only;
-    ``scene``: for tracing rays; ``surface``, ``maps``: device data; ``emission``: what the
-    materials emit, which is not rendered; None if they do not; ``coverage``: what light the
-    materials keep back; None if all of it.
+    ``drawn``: the same on the device; ``emission``: what the materials emit, which is not rendered;
+    None if they do not; ``coverage``: what light the materials keep back; None if all of it.
     """
 
     def __init__(self, asset: Asset) -> None:
         by_id = {id(m.material): m.material for m in asset.meshes}
         number = {key: k for k, key in enumerate(by_id)}
-        self.maps = material_maps(list(by_id.values()))
+        maps = material_maps(list(by_id.values()))
         self.emission = emission_maps(list(by_id.values()))
         self.coverage = coverage_maps(list(by_id.values()))
         self.merged = merge(
-            asset, [number[id(m.material)] for m in asset.meshes], self.maps.has_normal_map
+            asset, [number[id(m.material)] for m in asset.meshes], maps.has_normal_map
         )
         m = self.merged
         self.single = single_sided(asset.meshes)
@@ -73,24 +61,26 @@ class MeshReference:
                 [seen_through(m) for m in asset.meshes], [len(m.faces) for m in asset.meshes]
             )
         hidden_backs = culled(m.positions, m.faces, self.single, passing)
-        self.scene = upload.scene_of(m.positions, m.faces, hidden_backs)
-        if m.tangents is None:
-            frames = upload.packets(2, m.uvs)
-        else:
-            frames = upload.packets(
-                8, m.uvs, m.tangents[:, 3], np.zeros(len(m.uvs)), m.tangents[:, :3]
-            )
-        padding = np.zeros(len(m.positions))
-        self.surface = Surface(
-            faces=upload.index_packets(m.faces, m.material),
-            vertices=upload.packets(8, m.positions, padding, m.normals),
-            frames=frames if self._needs_uvs() else None,
-            colors=None if m.colors is None else upload.packets(4, m.colors),
-            has_tangents=m.tangents is not None,
-            culled=None if hidden_backs is None else mi.Bool(hidden_backs),
-        )
+        uvs = m.uvs if self._needs_uvs(maps) else None
+        self.drawn = Drawn.of(replace(m, uvs=uvs, culled=hidden_backs), maps)
+        self._renderer: Renderer = images if self.coverage is None else SeenThrough(self.coverage)
         self._run = Frozen(self.surface, self.maps, self.coverage)
-        self._grid: Grid | None = None
+        self._grid: pixels.Grid | None = None
+
+    @property
+    def scene(self) -> Scene:
+        """The mesh, for tracing rays."""
+        return self.drawn.scene
+
+    @property
+    def surface(self) -> Surface:
+        """The mesh, for shading."""
+        return self.drawn.surface
+
+    @property
+    def maps(self) -> MaterialMaps:
+        """Its materials."""
+        return self.drawn.maps
 
     @property
     def bounds(self) -> NDArray[np.floating]:
@@ -103,16 +93,18 @@ class MeshReference:
         """Does all of it show its base colour whatever the light?"""
         return UNLIT in self.maps.constants
 
-    def _needs_uvs(self) -> bool:
+    def _needs_uvs(self, maps: MaterialMaps) -> bool:
         """Does any material look up a texture?"""
         emits = self.emission is not None and bool(self.emission.layers)
-        return bool(self.maps.layers) or emits or self.coverage is not None
+        return bool(maps.layers) or emits or self.coverage is not None
 
     def render(self, views: Views, resolution: int, samples: int = 16) -> NDArray[np.float32]:
         """See ``Reference.render``."""
         parts = self._parts(views, resolution)
-        images = [_host(self.render_device(p.records(), g, samples), g) for p, g in parts]
-        return np.concatenate(images)
+        drawn = [
+            _host(self.render_device(pixels.Batch(p.records(), g), samples), g) for p, g in parts
+        ]
+        return np.concatenate(drawn)
 
     def pair(
         self, views: Views, resolution: int, samples: int, width: float
@@ -121,50 +113,42 @@ class MeshReference:
         pairs = []
         with dr.suspend_grad():
             for part, grid in self._parts(views, resolution):
-                records, drawn = part.records(), (self.scene, self.surface, self.maps)
-                if self.coverage is not None:  # outlines of what is seen through may lie anywhere
-                    settings = (samples, None), (1, width)
-                    both = [self.render_device(records, grid, n, w) for n, w in settings]
-                else:
-                    both = [*deferred.render_pair(*drawn, records, grid, samples, width, self._run)]
+                batch = pixels.Batch(part.records(), grid)
+                both = self._renderer.render_pair(self.drawn, batch, samples, width, self._run)
                 pairs.append([_host(image, grid) for image in both])
-        average, points = (np.concatenate(images) for images in zip(*pairs, strict=True))
+        average, points = (np.concatenate(parts) for parts in zip(*pairs, strict=True))
         return average, points
 
-    def _parts(self, views: Views, resolution: int) -> Iterator[tuple[Views, Grid]]:
+    def _parts(self, views: Views, resolution: int) -> Iterator[tuple[Views, pixels.Grid]]:
         """Views in batches of at most ``MAX_PIXELS`` pixels, with their grids."""
         step = max(1, MAX_PIXELS // (resolution * resolution))
         for start in range(0, len(views), step):
             part = views[start : start + step]
             yield part, self._grid_of(len(part), resolution)
 
-    def _grid_of(self, views: int, resolution: int) -> Grid:
+    def _grid_of(self, views: int, resolution: int) -> pixels.Grid:
         """The pixels of a batch; the last ones are kept, for batches come in equal sizes."""
         if self._grid is None or (self._grid.views, self._grid.resolution) != (views, resolution):
-            self._grid = Grid(views, resolution)
+            self._grid = pixels.Grid(views, resolution)
         return self._grid
 
     def render_device(
-        self, records: mi.Float, grid: Grid, samples: int, width: float | None = None
+        self, batch: pixels.Batch, samples: int, width: float | None = None
     ) -> mi.Float:
-        """The same for a batch whose records are on the device; the image stays there, flat.
-        ``width``: as for ``deferred.render_image``."""
+        """The same for a batch on the device; the image stays there, flat. ``width``: as for
+        ``images.render_image``."""
         with dr.suspend_grad():
-            drawn = self.scene, self.surface, self.maps
-            if self.coverage is not None:
-                return layers.render_image(
-                    *drawn, self.coverage, records, grid, samples, width, self._run
-                )
-            return deferred.render_image(*drawn, records, grid, samples, width, self._run)
+            return self._renderer.render_image(self.drawn, batch, samples, width, self._run)
 
 
-def _host(image: mi.Float, grid: Grid) -> NDArray[np.float32]:
+def _host(image: mi.Float, grid: pixels.Grid) -> NDArray[np.float32]:
     return np.array(image).reshape(grid.views, grid.resolution, grid.resolution, 4)
 
 
-def merge(asset: Asset, material_of: list[int], need_tangents: bool) -> MergedMesh:
-    """Concatenate the meshes of an asset; computes what a mesh lacks (angle-weighted normals,
-    MikkTSpace tangents where a normal map needs them, zero UVs, white vertex colours)."""
+def merge(asset: Asset, material_of: list[int], need_tangents: bool) -> MeshArrays:
+    """Concatenate the meshes of an asset, vertices split where attributes differ; computes what a
+    mesh lacks (angle-weighted normals, MikkTSpace tangents where a normal map needs them, zero UVs,
+    white vertex colours)."""
     meshes = fill_normals(asset.meshes)
     if need_tangents:
         lacking = [m.tangents is None for m in meshes]
@@ -181,7 +165,7 @@ def merge(asset: Asset, material_of: list[int], need_tangents: bool) -> MergedMe
         tangents[free] = np.concatenate(
             [any_tangent(normals[free]), np.ones((int(free.sum()), 1))], axis=1
         )
-    return MergedMesh(
+    return MeshArrays(
         positions=batch.joined("positions"),
         normals=normals,
         uvs=batch.joined("uvs"),

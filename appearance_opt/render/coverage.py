@@ -16,10 +16,11 @@ from typing import TYPE_CHECKING
 import drjit as dr
 import mitsuba as mi
 
-from appearance_opt.render import rays
+from appearance_opt.render.lattice import sub_pixel_offsets
 from appearance_opt.render.math import at_least, at_most
 
 if TYPE_CHECKING:
+    from appearance_opt.render.pixels import Grid
     from appearance_opt.render.silhouette import EdgeSamples
 
 
@@ -36,28 +37,25 @@ def half_plane_area(nx: mi.Float, ny: mi.Float, distance: mi.Float) -> mi.Float:
     return dr.select(distance > 0, 1 - beyond, beyond)
 
 
-def correction(
-    edges: EdgeSamples, contrast: mi.ArrayXf, pixels: int, samples: int, size: mi.UInt32
-) -> mi.Float:
+def correction(edges: EdgeSamples, contrast: mi.ArrayXf, samples: int, grid: Grid) -> mi.Float:
     """What ``samples`` rays per pixel missed: (pixels * 4) premultiplied radiance and coverage,
-    zero where no silhouette point lies. ``contrast``: c_in - c_out at the points; ``size``:
-    resolution."""
-    row = edges.pixel // size
-    column = edges.pixel - row * size
-    row -= (row // size) * size
+    zero where no silhouette point lies. ``contrast``: c_in - c_out at the points."""
+    row = edges.pixel // grid.rows
+    column = edges.pixel - row * grid.rows
+    row -= (row // grid.rows) * grid.rows
     x = edges.inside.x - mi.Float(column) - 0.5
     y = edges.inside.y - mi.Float(row) - 0.5
     nx, ny = edges.normal_x, edges.normal_y
     distance = dr.fma(nx, x, ny * y)
     seen = mi.Float(0)
-    for dx, dy in rays.sub_pixel_offsets(samples) - 0.5:
+    for dx, dy in sub_pixel_offsets(samples) - 0.5:
         seen += dr.select(nx * float(dx) + ny * float(dy) < distance, mi.Float(1 / samples), 0)
     missed = half_plane_area(nx, ny, distance) - seen
     # several points of one line: their mean
-    count = dr.zeros(mi.UInt32, pixels)
+    count = dr.zeros(mi.UInt32, grid.pixels)
     dr.scatter_reduce(dr.ReduceOp.Add, count, mi.UInt32(1), edges.pixel)
     missed /= mi.Float(dr.gather(mi.UInt32, count, edges.pixel))
-    out = dr.zeros(mi.Float, pixels * 4)
+    out = dr.zeros(mi.Float, grid.pixels * 4)
     dr.scatter_reduce(dr.ReduceOp.Add, out, contrast * missed, edges.pixel)
     return out
 

@@ -23,22 +23,21 @@ import drjit as dr
 import mitsuba as mi
 
 from appearance_opt.render import coverage, intersections, pairs, rays, silhouette
-from appearance_opt.render.deferred import shade, visible
 from appearance_opt.render.freezing import traced
 from appearance_opt.render.intersections import Intersections
-from appearance_opt.render.material import MaterialMaps
-from appearance_opt.render.pixels import Grid, pixel_index
+from appearance_opt.render.passing import MISS
+from appearance_opt.render.pixels import Batch, Grid, pixel_index
 from appearance_opt.render.quality import Quality
-from appearance_opt.render.ray_lists import Weighted, Whole, concat, join_arrays
-from appearance_opt.render.rays import MISS, Samples
-from appearance_opt.render.silhouette import EdgeList, EdgeSamples
-from appearance_opt.render.surface import Surface
+from appearance_opt.render.samples import Samples, Weighted, Whole, concat, join_arrays
+from appearance_opt.render.shading import shade
+from appearance_opt.render.silhouette import EdgeSamples
+from appearance_opt.render.visibility import see_grid
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from appearance_opt.render.drawn import Drawn
     from appearance_opt.render.freezing import Run
-    from appearance_opt.render.passing import Scene
 
 
 DEFERRED = 4
@@ -59,8 +58,7 @@ class RenderedBatch:
     for that.
     """
 
-    grid: Grid
-    records: mi.Float
+    batch: Batch
     image: mi.Float
     averaged: Weighted | None
     deferred: Whole | None
@@ -74,32 +72,26 @@ class RenderedBatch:
         """(pixels,) which pixels of the image are not deferred; None if none is."""
         if self.deferred is None:
             return None
-        out = dr.full(mi.Bool, True, self.grid.pixels)
+        out = dr.full(mi.Bool, True, self.batch.grid.pixels)
         dr.scatter(out, mi.Bool(False), self.deferred.pixel)
         return out
 
 
 def render(
-    scene: Scene,
-    surface: Surface,
-    maps: MaterialMaps,
-    edge_list: EdgeList | None,
-    records: mi.Float,
-    grid: Grid,
+    drawn: Drawn,
+    batch: Batch,
     quality: Quality,
     seed: int,
-    defer: bool = False,
     run: Run = traced,
+    defer: bool = False,
 ) -> RenderedBatch:
-    """Forward pass, without gradients (``surface`` and ``maps`` are read detached). With ``defer``,
-    pixels of few samples that no silhouette crosses are not shaded but left to ``direct``. ``run``:
-    how its stages are called (see ``freezing``)."""
+    """Forward pass, without gradients (``drawn`` is read detached). With ``defer``, pixels of few
+    samples that no silhouette crosses are not shaded but left to ``direct``. ``run``: how its
+    stages are called (see ``freezing``)."""
     with dr.suspend_grad():
         edges, met, filtered = None, None, quality.sample_width
-        if quality.visibility == "pairs" and edge_list is not None:
-            found = pairs.paired_samples(
-                scene, edge_list, surface.vertices, records, grid, quality, defer, run
-            )
+        if quality.visibility == "pairs" and drawn.edges is not None:
+            found = pairs.paired_samples(drawn, batch, quality, defer, run)
             averaged, deferred, crossed = found.averaged, found.deferred, found.crossed
             edges, met, filtered = (
                 found.edges,
@@ -107,56 +99,33 @@ def render(
                 quality.sample_width / isqrt(quality.samples),
             )
         else:
-            if quality.visibility == "edges" and edge_list is not None and quality.edge_density > 0:
-                edges = silhouette.sample_edges(
-                    scene,
-                    edge_list,
-                    surface.vertices,
-                    records,
-                    grid,
-                    quality.edge_density,
-                    seed,
-                    run,
-                )
+            if (
+                quality.visibility == "edges"
+                and drawn.edges is not None
+                and quality.edge_density > 0
+            ):
+                edges = silhouette.sample_edges(drawn, batch, quality.edge_density, seed, run)
                 if quality.intersections:
-                    per_axis = isqrt(quality.samples)
-                    met = pairs.find_intersections(
-                        scene, edge_list, surface.vertices, records, grid, per_axis, run
-                    )
+                    met = pairs.find_intersections(drawn, batch, isqrt(quality.samples), run)
             crossing = [b.pixel for b in (edges, met) if b is not None]
             averaged, deferred, crossed = _camera_samples(
-                scene, surface, records, grid, crossing, quality, defer, run
+                drawn, batch, crossing, quality, defer, run
             )
         width = dr.opaque(mi.Float, filtered)
         # pairs blend what few rays miss; elsewhere the silhouette's line knows it
         corrected = quality.edge_samples if quality.visibility == "edges" else None
         image, contrast, met_contrast = run(
-            _averages,
-            surface,
-            maps,
-            records,
-            grid.size,
-            grid.rows,
-            grid.pixels,
-            averaged,
-            edges,
-            met,
-            width,
-            corrected,
+            _averages, drawn, batch, averaged, edges, met, width, corrected
         )
         dr.eval(image, contrast, met_contrast)
     return RenderedBatch(
-        grid, records, image, averaged, deferred, crossed, edges, contrast, met, met_contrast
+        batch, image, averaged, deferred, crossed, edges, contrast, met, met_contrast
     )
 
 
 def _averages(
-    surface: Surface,
-    maps: MaterialMaps,
-    records: mi.Float,
-    size: mi.Float,
-    rows: mi.UInt32,
-    pixels: int,
+    drawn: Drawn,
+    batch: Batch,
     averaged: Weighted | None,
     edges: EdgeSamples | None,
     met: Intersections | None,
@@ -166,72 +135,58 @@ def _averages(
     """(image without the deferred pixels, contrast at the silhouette points, and where surfaces
     meet). ``width`` of the texture filter of contrasts in pixels; ``corrected``: rays per pixel of
     which the image corrects the coverage."""
-    image = dr.zeros(mi.Float, pixels * 4)
+    image = dr.zeros(mi.Float, batch.grid.pixels * 4)
     if averaged is not None:
         w = averaged.weight
-        c = shade(surface, maps, records, averaged.samples, size, averaged.width)
+        c = shade(drawn, batch, averaged.samples, averaged.width)
         value = mi.ArrayXf([c.x * w, c.y * w, c.z * w, w])
         dr.scatter_reduce(dr.ReduceOp.Add, image, value, averaged.pixel, mode=dr.ReduceMode.Local)
     contrast, met_contrast = (
-        None if b is None else _contrast(surface, maps, records, b.inside, b.outside, size, width)
+        None if b is None else _contrast(drawn, batch, b.inside, b.outside, width)
         for b in (edges, met)
     )
     if edges is not None and corrected is not None:
         dr.eval(image, contrast)
-        missed = coverage.correction(edges, contrast, pixels, corrected, rows)
+        missed = coverage.correction(edges, contrast, corrected, batch.grid)
         image = coverage.add_missed(image, missed)
     return image, contrast, met_contrast
 
 
 def direct(
-    batch: RenderedBatch,
-    surface: Surface,
-    maps: MaterialMaps,
+    rendered: RenderedBatch,
+    drawn: Drawn,
     pixel_loss: Callable[[mi.Color3f, mi.UInt32], mi.Float],
 ) -> mi.Float | None:
     """Loss of each deferred pixel, differentiable: ``pixel_loss(radiance, pixel)`` of its radiance
     (all deferred pixels are fully covered). None without any."""
-    if batch.deferred is None:
+    if rendered.deferred is None:
         return None
-    d = batch.deferred
-    colors = [shade(surface, maps, batch.records, r, batch.grid.size, d.width) for r in d.rays]
+    d = rendered.deferred
+    colors = [shade(drawn, rendered.batch, r, d.width) for r in d.rays]
     return pixel_loss(sum(colors[1:], colors[0]) * (1 / len(colors)), d.pixel)
 
 
-def surrogate(
-    batch: RenderedBatch,
-    surface: Surface,
-    maps: MaterialMaps,
-    edge_list: EdgeList | None,
-    image_gradient: mi.Float,
-) -> list[mi.Float]:
+def surrogate(rendered: RenderedBatch, drawn: Drawn, image_gradient: mi.Float) -> list[mi.Float]:
     """Arrays whose sums have the loss's derivative, for ``image_gradient`` = dLoss/dImage (pixels *
     4).
 
     Only their gradients mean anything: pass them to ``backward``. They are not summed here, as a
     sum would evaluate them and make the backward pass shade once more. Empty when the batch is.
     """
-    terms = []
-    if batch.averaged is not None:
-        a = batch.averaged
-        color = shade(surface, maps, batch.records, a.samples, batch.grid.size, a.width)
+    terms, batch = [], rendered.batch
+    if rendered.averaged is not None:
+        a = rendered.averaged
+        color = shade(drawn, batch, a.samples, a.width)
         g = _pixel(image_gradient, a.pixel)
         terms.append(dr.fma(g[0], color.x, dr.fma(g[1], color.y, g[2] * color.z)) * a.weight)
-    if edge_list is None or not dr.grad_enabled(surface.vertices):
+    if drawn.edges is None or not dr.grad_enabled(drawn.surface.vertices):
         return terms
-    moving = (edge_list, surface.vertices, batch.records)
-    if batch.edges is not None:
-        jump = _jump(image_gradient, batch.edges.pixel, batch.contrast)
-        terms.append(
-            jump * batch.edges.length * silhouette.motion(*moving, batch.edges, batch.grid.size)
-        )
-    if batch.intersections is not None:
-        jump = _jump(image_gradient, batch.intersections.pixel, batch.intersections_contrast)
-        terms.append(
-            jump
-            * batch.intersections.area
-            * intersections.motion(*moving, batch.intersections, batch.grid.size)
-        )
+    if (points := rendered.edges) is not None:
+        jump = _jump(image_gradient, points.pixel, rendered.contrast)
+        terms.append(jump * points.length * silhouette.motion(drawn, batch, points))
+    if (met := rendered.intersections) is not None:
+        jump = _jump(image_gradient, met.pixel, rendered.intersections_contrast)
+        terms.append(jump * met.area * intersections.motion(drawn, batch, met))
     return terms
 
 
@@ -246,10 +201,8 @@ def backward(terms: list[mi.Float]) -> None:
 
 
 def _camera_samples(
-    scene: Scene,
-    surface: Surface,
-    records: mi.Float,
-    grid: Grid,
+    drawn: Drawn,
+    batch: Batch,
     crossing: list[mi.UInt32],
     quality: Quality,
     defer: bool,
@@ -257,22 +210,21 @@ def _camera_samples(
 ) -> tuple[Weighted | None, Whole | None, mi.UInt32 | None]:
     """Covered camera rays, (averaged, deferred): ``samples`` in each pixel, ``edge_samples`` in
     those of ``crossing``, where a boundary passes; and these pixels, each once."""
+    grid = batch.grid
     on_edge = dr.zeros(mi.Bool, grid.pixels)
     for pixels in crossing:
         dr.scatter(on_edge, mi.Bool(True), pixels)
     dr.eval(on_edge)
-    pixel = (grid.view * grid.rows + grid.row) * grid.rows + grid.column
+    pixel = grid.index
     on_edge = dr.gather(mi.Bool, on_edge, pixel)
     dr.eval(on_edge, pixel)
 
     def rays_in(places: mi.UInt32, count: int) -> tuple[Samples, mi.Bool]:
-        return rays.trace_pixels(
-            scene, records, grid.view, grid.column, grid.row, places, count, grid.size, run
-        )
+        return rays.trace_pixels(drawn.scene, batch, places, count, run)
 
     if quality.samples == 1:
-        fine, _, covered = visible(scene, surface, records, grid, 0.5, 0.5, run)
-        covered &= ~on_edge
+        seen = see_grid(drawn, batch, 0.5, 0.5, run)
+        fine, covered = seen.samples, seen.hit & ~on_edge
     else:
         fine, covered = rays_in(dr.compress(~on_edge), quality.samples)
     deferred, others = None, covered
@@ -280,12 +232,12 @@ def _camera_samples(
         deferred, others = _whole_pixels(fine, covered, grid, quality)
     parts, weights, crossed = [], [], None
     if others is not None:
-        parts, weights = [rays.keep(fine, dr.compress(others))], [1 / quality.samples]
+        parts, weights = [fine.keep(dr.compress(others))], [1 / quality.samples]
     if crossing:
         places = dr.compress(on_edge)
         crossed = dr.gather(mi.UInt32, pixel, places)
         fine, covered = rays_in(places, quality.edge_samples)
-        parts.append(rays.keep(fine, dr.compress(covered)))
+        parts.append(fine.keep(dr.compress(covered)))
         weights.append(1 / quality.edge_samples)
     return _merge_weighted(parts, weights, grid, quality.sample_width), deferred, crossed
 
@@ -310,7 +262,7 @@ def _whole_pixels(
         )
     if dr.width(first) == 0:
         return None, others
-    every = [rays.keep(fine, first + k) for k in range(count)]
+    every = [fine.keep(first + k) for k in range(count)]
     pixel = pixel_index(every[0], grid.rows)
     width = quality.point_width if count == 1 else quality.sample_width * count**-0.5
     dr.eval(every, pixel)
@@ -332,20 +284,14 @@ def _merge_weighted(
 
 
 def _contrast(
-    surface: Surface,
-    maps: MaterialMaps,
-    records: mi.Float,
-    inside: Samples,
-    outside: Samples,
-    size: mi.Float,
-    width: mi.Float,
+    drawn: Drawn, batch: Batch, inside: Samples, outside: Samples, width: mi.Float
 ) -> mi.ArrayXf:
     """c_in - c_out of samples on the two sides of boundaries: premultiplied RGB and coverage."""
 
     def seen(side: Samples) -> mi.ArrayXf:
         covered = side.triangle != MISS
         hits = Samples(side.view, side.x, side.y, dr.select(covered, side.triangle, 0))
-        color = shade(surface, maps, records, hits, size, width) & covered
+        color = shade(drawn, batch, hits, width) & covered
         return mi.ArrayXf([color.x, color.y, color.z, dr.select(covered, mi.Float(1), 0)])
 
     return seen(inside) - seen(outside)

@@ -13,11 +13,14 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from appearance_opt.render import rays, silhouette
+from appearance_opt.render.camera import Camera, camera_of, direction
+from appearance_opt.render.drawn import Drawn
 from appearance_opt.render.math import clamp
-from appearance_opt.render.rays import Samples
-from appearance_opt.render.silhouette import EdgeList
+from appearance_opt.render.pixels import Batch
+from appearance_opt.render.samples import Samples
+from appearance_opt.render.silhouette import edges_of
 from appearance_opt.render.silhouette_walk import Neighbours
+from appearance_opt.render.surface import vertex_position
 
 FLATTEST = 2e-5
 """Sheets whose reciprocal depths differ less, before and behind a crossing together and relative to
@@ -43,24 +46,17 @@ class Intersections:
     pixel: mi.UInt32
 
 
-def find(
-    edges: EdgeList,
-    vertices: mi.Float,
-    records: mi.Float,
-    pairs: Neighbours,
-    resolution: mi.Float,
-) -> Intersections | None:
+def find(drawn: Drawn, batch: Batch, pairs: Neighbours) -> Intersections | None:
     """The crossings between samples whose sheets go on under each other. None without any. ``area``
     and ``pixel`` are left to the caller."""
     front, back = pairs.front, pairs.back
-    camera = rays.camera_of(records, front.view)
-    first, last = _differences(edges, vertices, camera, front, back, resolution)
-    one, other = (_slope(edges, vertices, camera, s.triangle) for s in (front, back))
+    camera = camera_of(batch.records, front.view)
+    first, last = _differences(drawn, batch, front, back)
+    one, other = (_slope(_plane(drawn, camera, s.triangle), camera) for s in (front, back))
     dx, dy = dr.abs(one[0] - other[0]), dr.abs(one[1] - other[1])
     ours = dr.select(pairs.horizontal, dx >= dy, dy > dx)
-    inverse_depth = dr.abs(
-        _inverse_depth(edges, vertices, camera, front.triangle, front, resolution)
-    )
+    ray = direction(camera, front.x, front.y, batch.grid.size)
+    inverse_depth = dr.abs(dr.dot(_plane(drawn, camera, front.triangle), ray))
     steep = first - last > FLATTEST * inverse_depth
     kept = dr.compress(ours & steep & (first > 0) & (last < 0))
     if dr.width(kept) == 0:
@@ -70,69 +66,38 @@ def find(
     return Intersections(p.front, p.back, p.horizontal, position, mi.Float(1), mi.UInt32(0))
 
 
-def motion(
-    edges: EdgeList,
-    vertices: mi.Float,
-    records: mi.Float,
-    found: Intersections,
-    resolution: mi.Float,
-) -> mi.Float:
-    """Position of each crossing in units of the samples' distance, differentiable in
-    ``vertices``."""
-    camera = rays.camera_of(records, found.inside.view)
-    first, last = _differences(edges, vertices, camera, found.inside, found.outside, resolution)
+def motion(drawn: Drawn, batch: Batch, found: Intersections) -> mi.Float:
+    """Position of each crossing in units of the samples' distance, differentiable in the
+    vertices."""
+    first, last = _differences(drawn, batch, found.inside, found.outside)
     return first / (first - last)
 
 
 def _differences(
-    edges: EdgeList,
-    vertices: mi.Float,
-    camera: rays.Camera,
-    front: Samples,
-    back: Samples,
-    resolution: mi.Float,
+    drawn: Drawn, batch: Batch, front: Samples, back: Samples
 ) -> tuple[mi.Float, mi.Float]:
     """Reciprocal depth of the front samples' triangles less that of the back samples', at the front
     samples and at the back samples. The planes that are seen stand for their sheets: hidden
     triangles can be edge-on."""
-    first, last = (
-        _inverse_depth(edges, vertices, camera, front.triangle, at, resolution)
-        - _inverse_depth(edges, vertices, camera, back.triangle, at, resolution)
-        for at in (front, back)
-    )
+    camera = camera_of(batch.records, front.view)
+    planes = [_plane(drawn, camera, s.triangle) for s in (front, back)]
+    rays = [direction(camera, s.x, s.y, batch.grid.size) for s in (front, back)]
+    first, last = (dr.dot(planes[0], ray) - dr.dot(planes[1], ray) for ray in rays)
     return first, last
 
 
-def _inverse_depth(
-    edges: EdgeList,
-    vertices: mi.Float,
-    camera: rays.Camera,
-    triangle: mi.UInt32,
-    at: Samples,
-    resolution: mi.Float,
-) -> mi.Float:
-    """Reciprocal depth of the planes of triangles at samples."""
-    return dr.dot(
-        _plane(edges, vertices, camera, triangle), rays.direction(camera, at.x, at.y, resolution)
-    )
+def _slope(plane: mi.Vector3f, camera: Camera) -> tuple[mi.Float, mi.Float]:
+    """Change of the reciprocal depth of planes across the image, to the right and down, but for a
+    common factor."""
+    return dr.dot(plane, camera.right), dr.dot(plane, camera.down)
 
 
-def _slope(
-    edges: EdgeList, vertices: mi.Float, camera: rays.Camera, triangle: mi.UInt32
-) -> tuple[mi.Float, mi.Float]:
-    """Change of the reciprocal depth across the image, to the right and down, but for a common
-    factor."""
-    n = _plane(edges, vertices, camera, triangle)
-    return dr.dot(n, camera.right), dr.dot(n, camera.down)
-
-
-def _plane(
-    edges: EdgeList, vertices: mi.Float, camera: rays.Camera, triangle: mi.UInt32
-) -> mi.Vector3f:
+def _plane(drawn: Drawn, camera: Camera, triangle: mi.UInt32) -> mi.Vector3f:
     """The vector whose product with a ray's direction is the reciprocal depth of the triangle's
     plane along it."""
-    face = dr.gather(mi.ArrayXu, edges.around, triangle, shape=(12, dr.width(triangle)))
-    a, b, c = (silhouette.position(vertices, face[k]) for k in range(3))
+    around = edges_of(drawn).around
+    face = dr.gather(mi.ArrayXu, around, triangle, shape=(12, dr.width(triangle)))
+    a, b, c = (vertex_position(drawn.surface, face[k]) for k in range(3))
     n = dr.cross(b - a, c - a)
     height = dr.dot(n, a - camera.eye)
     return n / dr.select(dr.abs(height) > 1e-30, height, 1e-30)

@@ -15,20 +15,23 @@ from typing import TYPE_CHECKING
 import drjit as dr
 import mitsuba as mi
 
-from appearance_opt.render import deferred, rays
+from appearance_opt.render import images
+from appearance_opt.render.camera import camera_of, direction
 from appearance_opt.render.freezing import traced
 from appearance_opt.render.material import TexelLayer
 from appearance_opt.render.passing import MISS, meet
-from appearance_opt.render.pixels import Grid, pixel_index
+from appearance_opt.render.pixels import pixel_index
+from appearance_opt.render.samples import Samples
+from appearance_opt.render.shading import shade
 from appearance_opt.render.surface import interpolate
+from appearance_opt.render.visibility import Visible
 
 if TYPE_CHECKING:
-    from appearance_opt.render.deferred import Drawing
+    from appearance_opt.render.drawn import Drawn
     from appearance_opt.render.freezing import Run
-    from appearance_opt.render.material import MaterialMaps
-    from appearance_opt.render.passing import Scene
-    from appearance_opt.render.rays import Samples
-    from appearance_opt.render.surface import Hit, Surface
+    from appearance_opt.render.images import Footprint
+    from appearance_opt.render.pixels import Batch
+    from appearance_opt.render.surface import Hit
 
 MOST = 128
 """Layers that a ray is followed through, empty parts of cut-outs included. What lies behind is not
@@ -56,74 +59,86 @@ class Coverage:
         return dr.select(cutoff < 0, share, dr.select(share >= cutoff, mi.Float(1), mi.Float(0)))
 
 
-def render_image(
-    scene: Scene,
-    surface: Surface,
-    maps: MaterialMaps,
-    coverage: Coverage,
-    records: mi.Float,
-    grid: Grid,
-    samples: int,
-    width: float | None = None,
-    run: Run = traced,
-) -> mi.Float:
-    """``deferred.render_image`` of a surface that is seen through. Memory grows neither with
-    ``samples`` nor with the layers; rays whose light is used up take no part in further layers."""
-    drawing = deferred.Drawing(surface, maps, records, grid.size, grid.rows)
-    width = deferred.filter_width(samples) if width is None else width
-    weight, filtered = dr.opaque(mi.Float, 1 / samples), dr.opaque(mi.Float, width)
-    image = dr.zeros(mi.Float, grid.pixels * 4)
-    for dx, dy in rays.sub_pixel_offsets(samples):
-        hits, depth, hit = deferred.visible(scene, surface, records, grid, dx, dy, run)
-        light = dr.ones(mi.Float, dr.width(depth))
+@dataclass(frozen=True)
+class SeenThrough:
+    """An ``images.Renderer`` of surfaces that are seen through, by what each keeps back."""
+
+    coverage: Coverage
+
+    def render_image(
+        self,
+        drawn: Drawn,
+        batch: Batch,
+        samples: int,
+        width: float | None = None,
+        run: Run = traced,
+    ) -> mi.Float:
+        """See ``images.render_image``. Memory grows neither with ``samples`` nor with the
+        layers."""
+        return images.render_image(drawn, batch, samples, width, run, self.add_layers)
+
+    def render_pair(
+        self, drawn: Drawn, batch: Batch, samples: int, width: float, run: Run = traced
+    ) -> tuple[mi.Float, mi.Float]:
+        """See ``images.render_pair``. The average is one everywhere: outlines of what is seen
+        through may lie anywhere."""
+        average = self.render_image(drawn, batch, samples, None, run)
+        return average, self.render_image(drawn, batch, 1, width, run)
+
+    def add_layers(
+        self,
+        image: mi.Float,
+        drawn: Drawn,
+        batch: Batch,
+        seen: Visible,
+        footprint: Footprint,
+        run: Run,
+    ) -> mi.Float:
+        """All layers along the rays, from the eye on; see ``images.Resolve``. Rays whose light is
+        used up take no part in further layers."""
+        light = dr.ones(mi.Float, dr.width(seen.depth))
         dr.eval(light)
         for _ in range(MOST):
-            going = dr.compress(hit & (light >= LEAST))
+            going = dr.compress(seen.hit & (light >= LEAST))
             if dr.width(going) == 0:
                 break
-            hits, depth, light = _taken(going, hits, depth, light)
-            share = run(_kept_back, drawing, coverage, hits, light, filtered)
+            seen, light = seen.keep(going), dr.gather(mi.Float, light, going)
+            dr.eval(seen, light)
+            share = run(_kept_back, drawn, batch, self.coverage, seen.samples, light, footprint)
             dr.eval(share)
-            image = _blend(image, drawing, hits, share, weight, filtered, run)
+            image = _blend(image, drawn, batch, seen.samples, share, footprint, run)
             light = light - share
             left = dr.compress(light >= LEAST)
             if dr.width(left) == 0:
                 break
-            hits, depth, light = _taken(left, hits, depth, light)
-            hits, depth = run(_behind, scene, records, hits, depth, grid.size)
-            hit = hits.triangle != MISS
-            dr.eval(hits, depth, hit)
-    return image
-
-
-def _taken(
-    index: mi.UInt32, hits: Samples, depth: mi.Float, light: mi.Float
-) -> tuple[Samples, mi.Float, mi.Float]:
-    """Those at the positions ``index`` of the lists."""
-    out = (
-        rays.keep(hits, index),
-        dr.gather(mi.Float, depth, index),
-        dr.gather(mi.Float, light, index),
-    )
-    dr.eval(out)
-    return out
+            seen, light = seen.keep(left), dr.gather(mi.Float, light, left)
+            dr.eval(seen, light)
+            seen = run(_behind, drawn, batch, seen)
+            dr.eval(seen)
+        return image
 
 
 def _kept_back(
-    drawing: Drawing, coverage: Coverage, hits: Samples, light: mi.Float, width: mi.Float
+    drawn: Drawn,
+    batch: Batch,
+    coverage: Coverage,
+    hits: Samples,
+    light: mi.Float,
+    footprint: Footprint,
 ) -> mi.Float:
     """What hits keep back of the ``light`` of their rays."""
-    camera = rays.camera_of(drawing.records, hits.view)
-    return coverage.at(interpolate(drawing.surface, camera, hits, drawing.size, width)) * light
+    camera = camera_of(batch.records, hits.view)
+    hit = interpolate(drawn.surface, camera, hits, batch.grid.size, footprint.width)
+    return coverage.at(hit) * light
 
 
 def _blend(
     image: mi.Float,
-    drawing: Drawing,
+    drawn: Drawn,
+    batch: Batch,
     hits: Samples,
     share: mi.Float,
-    weight: mi.Float,
-    width: mi.Float,
+    footprint: Footprint,
     run: Run,
 ) -> mi.Float:
     """The image with a layer of hits, one at most per pixel: only those are shaded that keep
@@ -131,38 +146,36 @@ def _blend(
     index = dr.compress(share > 0)
     if dr.width(index) == 0:
         return image
-    image = run(_accumulate, image, drawing, hits, index, share, weight, width)
+    image = run(_accumulate, image, drawn, batch, (hits, index), share, footprint)
     dr.eval(image)
     return image
 
 
 def _accumulate(
     image: mi.Float,
-    drawing: Drawing,
-    hits: Samples,
-    index: mi.UInt32,
+    drawn: Drawn,
+    batch: Batch,
+    shaded: tuple[Samples, mi.UInt32],
     share: mi.Float,
-    weight: mi.Float,
-    width: mi.Float,
+    footprint: Footprint,
 ) -> mi.Float:
-    some = rays.keep(hits, index)
-    color = deferred.shade(
-        drawing.surface, drawing.maps, drawing.records, some, drawing.size, width
-    )
-    part = dr.gather(mi.Float, share, index) * weight
+    some = shaded[0].keep(shaded[1])
+    color = shade(drawn, batch, some, footprint.width)
+    part = dr.gather(mi.Float, share, shaded[1]) * footprint.weight
     out = mi.Float(image)
     value = mi.ArrayXf([color.x * part, color.y * part, color.z * part, part])
-    pixel = pixel_index(some, drawing.rows)
+    pixel = pixel_index(some, batch.grid.rows)
     dr.scatter_reduce(dr.ReduceOp.Add, out, value, pixel, mode=dr.ReduceMode.NoConflicts)
     return out
 
 
-def _behind(
-    scene: Scene, records: mi.Float, hits: Samples, depth: mi.Float, size: mi.Float
-) -> tuple[Samples, mi.Float]:
-    """(what the rays of hits meet next, its depth)."""
-    camera = rays.camera_of(records, hits.view)
-    d = rays.direction(camera, hits.x, hits.y, size)
+def _behind(drawn: Drawn, batch: Batch, seen: Visible) -> Visible:
+    """What the rays meet next."""
+    hits = seen.samples
+    camera = camera_of(batch.records, hits.view)
+    d = direction(camera, hits.x, hits.y, batch.grid.size)
     length = dr.norm(d)
-    met = meet(scene, mi.Ray3f(camera.eye, d / length), after=depth * length, coherent=True)
-    return rays.Samples(hits.view, hits.x, hits.y, met.triangle), met.t / length
+    ray = mi.Ray3f(camera.eye, d / length)
+    met = meet(drawn.scene, ray, after=seen.depth * length, coherent=True)
+    samples = Samples(hits.view, hits.x, hits.y, met.triangle)
+    return Visible(samples, met.t / length, met.triangle != MISS)

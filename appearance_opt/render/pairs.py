@@ -31,19 +31,20 @@ from typing import TYPE_CHECKING
 import drjit as dr
 import mitsuba as mi
 
-from appearance_opt.render import intersections, rays, silhouette
+from appearance_opt.render import intersections, rays
+from appearance_opt.render.camera import camera_of, project
 from appearance_opt.render.freezing import traced
 from appearance_opt.render.intersections import Intersections
 from appearance_opt.render.math import clamp
-from appearance_opt.render.pixels import Grid, pixel_index
-from appearance_opt.render.ray_lists import Weighted, Whole, concat, join_arrays
-from appearance_opt.render.rays import MISS, Samples
-from appearance_opt.render.silhouette import EdgeList, EdgeSamples
+from appearance_opt.render.passing import MISS
+from appearance_opt.render.pixels import Batch, pixel_index
+from appearance_opt.render.samples import Samples, Weighted, Whole, concat, join_arrays
+from appearance_opt.render.silhouette import EdgeSamples, edges_of, gather_edges
 from appearance_opt.render.silhouette_walk import Neighbours, choose, neighbours, walk
 
 if TYPE_CHECKING:
+    from appearance_opt.render.drawn import Drawn
     from appearance_opt.render.freezing import Run
-    from appearance_opt.render.passing import Scene
     from appearance_opt.render.quality import Quality
 
 
@@ -76,11 +77,15 @@ class Paired:
 
 @dataclass
 class _Fine:
-    """The grid of samples: ``per_axis`` squared in every pixel of ``grid``."""
+    """The grid of ``samples``: ``per_axis`` squared in every pixel of ``image``."""
 
-    samples: Grid
-    grid: Grid
+    samples: Batch
+    image: Batch
     per_axis: int
+
+    @classmethod
+    def of(cls, batch: Batch, per_axis: int) -> _Fine:
+        return cls(Batch(batch.records, batch.grid.finer(per_axis)), batch, per_axis)
 
     def coarse(self, samples: Samples) -> Samples:
         """Positions in pixels of the image, from those of the samples' grid."""
@@ -91,67 +96,38 @@ class _Fine:
 
 
 def paired_samples(
-    scene: Scene,
-    edges: EdgeList,
-    vertices: mi.Float,
-    records: mi.Float,
-    grid: Grid,
-    quality: Quality,
-    defer: bool,
-    run: Run = traced,
+    drawn: Drawn, batch: Batch, quality: Quality, defer: bool, run: Run = traced
 ) -> Paired:
     """Camera rays on a regular grid, with what pairs move between pixels. Pixels of a single ray
-    that no pair changes are deferred with ``defer``. No gradients. ``edges`` must be ``walkable``;
+    that no pair changes are deferred with ``defer``. No gradients. The edges must be ``walkable``;
     ``run``: see ``freezing``."""
-    assert edges.around is not None, "pairs walk over the mesh: use LatentTopology.walkable"
-    per_axis = isqrt(quality.samples)
-    fine = _Fine(grid.finer(per_axis), grid, per_axis)
-    s = fine.samples
-    hits, depth = run(_middles, scene, records, s.view, s.column, s.row, s.size)
+    fine = _Fine.of(batch, isqrt(quality.samples))
+    hits, depth = run(rays.trace_grid, drawn.scene, fine.samples)
     dr.eval(hits, depth)
-    found = find_pairs(edges, vertices, records, hits, depth, fine, run)
-    received = dr.zeros(mi.Float, s.pixels)
+    found = find_pairs(drawn, hits, depth, fine, run)
+    received = dr.zeros(mi.Float, fine.samples.grid.pixels)
     if found is not None:
         dr.scatter_reduce(dr.ReduceOp.Add, received, found.weight, found.receiver)
     averaged, deferred = _weights(hits, received, found, fine, quality, defer)
     if found is None:
         return Paired(averaged, deferred, None)
     dr.eval(found.pixel)
-    changed = dr.zeros(mi.Bool, grid.pixels)
+    changed = dr.zeros(mi.Bool, batch.grid.pixels)
     dr.scatter(changed, mi.Bool(True), found.pixel)
     return Paired(averaged, deferred, dr.compress(changed), found.edges, found.intersections)
 
 
 def find_intersections(
-    scene: Scene,
-    edges: EdgeList,
-    vertices: mi.Float,
-    records: mi.Float,
-    grid: Grid,
-    per_axis: int,
-    run: Run = traced,
+    drawn: Drawn, batch: Batch, per_axis: int, run: Run = traced
 ) -> Intersections | None:
     """Where surfaces run into each other, found between ``per_axis`` squared rays in every pixel,
     and nothing else of what pairs find: for other estimators of the derivative at silhouettes. None
     without any."""
-    fine = _Fine(grid.finer(per_axis), grid, per_axis)
-    s = fine.samples
-    hits, depth = run(_middles, scene, records, s.view, s.column, s.row, s.size)
+    fine = _Fine.of(batch, per_axis)
+    hits, depth = run(rays.trace_grid, drawn.scene, fine.samples)
     dr.eval(hits, depth)
-    found = find_pairs(edges, vertices, records, hits, depth, fine, run)
+    found = find_pairs(drawn, hits, depth, fine, run)
     return None if found is None else found.intersections
-
-
-def _middles(
-    scene: Scene,
-    records: mi.Float,
-    view: mi.UInt32,
-    column: mi.UInt32,
-    row: mi.UInt32,
-    size: mi.Float,
-) -> tuple[Samples, mi.Float]:
-    """What the rays through the middles of all pixels hit, and the depth of the hits."""
-    return rays.trace_depth(scene, records, view, mi.Float(column) + 0.5, mi.Float(row) + 0.5, size)
 
 
 def _weights(
@@ -164,28 +140,28 @@ def _weights(
 ) -> tuple[Weighted | None, Whole | None]:
     """Every covered sample in its own pixel, less what it receives, and the givers in the pixels of
     the receivers."""
-    own = rays.keep(hits, dr.compress(hits.triangle != MISS))
+    own = hits.keep(dr.compress(hits.triangle != MISS))
     if dr.width(own.triangle) == 0:
         return None, None
-    share = dr.gather(mi.Float, received, pixel_index(own, fine.samples.rows))
-    rows = fine.grid.rows
+    share = dr.gather(mi.Float, received, pixel_index(own, fine.samples.grid.rows))
+    rows = fine.image.grid.rows
     deferred = None
     if defer and fine.per_axis == 1:
         alone = dr.compress(share == 0)
         if dr.width(alone):
-            points = rays.keep(own, alone)
+            points = own.keep(alone)
             deferred = Whole(
                 [points], pixel_index(points, rows), dr.opaque(mi.Float, quality.point_width)
             )
         changed = dr.compress(share > 0)
-        own, share = rays.keep(own, changed), dr.gather(mi.Float, share, changed)
+        own, share = own.keep(changed), dr.gather(mi.Float, share, changed)
     parts = []
     if dr.width(own.triangle):
         own = fine.coarse(own)
         parts.append((own, pixel_index(own, rows), 1 - share))
     given = dr.compress(found.giver.triangle != MISS) if found is not None else mi.UInt32()
     if found is not None and dr.width(given):
-        giver = fine.coarse(rays.keep(found.giver, given))
+        giver = fine.coarse(found.giver.keep(given))
         parts.append(
             (
                 giver,
@@ -205,20 +181,14 @@ def _weights(
 
 
 def find_pairs(
-    edges: EdgeList,
-    vertices: mi.Float,
-    records: mi.Float,
-    hits: Samples,
-    depth: mi.Float,
-    fine: _Fine,
-    run: Run = traced,
+    drawn: Drawn, hits: Samples, depth: mi.Float, fine: _Fine, run: Run = traced
 ) -> Pairs | None:
     """The pairs among ``hits``, one sample in every pixel of the finer grid. None without any."""
-    every = neighbours(hits, depth, fine.samples)
+    assert edges_of(drawn).around is not None, "pairs walk over the mesh: use walkable edges"
+    every = neighbours(hits, depth, fine.samples.grid)
     if every is None:
         return None
-    size = fine.samples.size
-    edge, covers = run(walk, edges, vertices, records, every, size)
+    edge, covers = run(walk, drawn, fine.samples, every)
     kept = dr.compress(edge != MISS)
     outlines = [(every.keep(kept), dr.gather(mi.UInt32, edge, kept))]
     # the front sheet goes on under the back sample without being seen there: the back sheet lies
@@ -229,12 +199,12 @@ def find_pairs(
     met = None
     if dr.width(under):
         other = every.keep(under).swapped()
-        edge, returns = run(walk, edges, vertices, records, other, size)
+        edge, returns = run(walk, drawn, fine.samples, other)
         kept = dr.compress(edge != MISS)
         outlines.append((other.keep(kept), dr.gather(mi.UInt32, edge, kept)))
         kept = dr.compress((returns != MISS) & (returns != other.back.triangle))
         if dr.width(kept):
-            met = intersections.find(edges, vertices, records, other.keep(kept).swapped(), size)
+            met = intersections.find(drawn, fine.samples, other.keep(kept).swapped())
     parts: list[tuple] = []
     points = None
     outlines = [o for o in outlines if o[0].width]
@@ -247,7 +217,7 @@ def find_pairs(
                 join_arrays([outlines[0][1], outlines[1][1]]),
             )
         )
-        points, d = _outline_points(edges, vertices, records, edge, pairs, fine)
+        points, d = _outline_points(drawn, edge, pairs, fine)
         points.pixel, *blended = _blend(pairs, d, fine)
         parts.append((points.pixel, *blended))
     if met is not None:
@@ -272,8 +242,8 @@ def _blend(
     in_front = d < 0.5
     receiver = choose(in_front, pairs.front, pairs.back)
     out = (
-        pixel_index(fine.coarse(receiver), fine.grid.rows),
-        pixel_index(receiver, fine.samples.rows),
+        pixel_index(fine.coarse(receiver), fine.image.grid.rows),
+        pixel_index(receiver, fine.samples.grid.rows),
         dr.abs(d - 0.5),
         choose(in_front, pairs.back, pairs.front),
     )
@@ -282,20 +252,15 @@ def _blend(
 
 
 def _outline_points(
-    edges: EdgeList,
-    vertices: mi.Float,
-    records: mi.Float,
-    edge: mi.UInt32,
-    pairs: Neighbours,
-    fine: _Fine,
+    drawn: Drawn, edge: mi.UInt32, pairs: Neighbours, fine: _Fine
 ) -> tuple[EdgeSamples, mi.Float]:
     """(silhouette points without their pixels, distances from the front samples): where ``edge``
     crosses segments."""
     front, back, horizontal = pairs.front, pairs.back, pairs.horizontal
-    ends = dr.gather(mi.ArrayXu, edges.packets, edge, shape=(4, dr.width(edge)))
-    camera, size = rays.camera_of(records, front.view), fine.samples.size
-    ax, ay, _ = silhouette.project(camera, silhouette.position(vertices, ends[0]), size)
-    bx, by, _ = silhouette.project(camera, silhouette.position(vertices, ends[1]), size)
+    ends, batch = gather_edges(drawn, edge), fine.samples
+    camera = camera_of(batch.records, front.view)
+    ax, ay, _ = project(camera, ends.a, batch.grid.size)
+    bx, by, _ = project(camera, ends.b, batch.grid.size)
     a_across, b_across = dr.select(horizontal, ay, ax), dr.select(horizontal, by, bx)
     line = dr.select(horizontal, front.y, front.x)
     position = clamp((line - a_across) / (b_across - a_across), 0, 1)

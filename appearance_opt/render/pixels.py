@@ -1,27 +1,41 @@
-"""The pixels of a batch of images, and which of them a sample lies in."""
+"""The pixels of a batch of images, from where they are seen, and in which of them samples lie."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass, field
 
 import drjit as dr
 import mitsuba as mi
 
-from appearance_opt.render import rays
-from appearance_opt.render.rays import Samples
+# not only for the type checker: Dr.Jit resolves the annotations of data classes when it looks for
+# arrays
+from appearance_opt.render.samples import Samples
+
+TILE = 4
+"""Rays are ordered in tiles of 4 x 4 pixels: neighbours in the wavefront are neighbours in the
+image, which makes tracing faster than scan lines (docs/trials.md: kernels)."""
 
 
+@dataclass(eq=False)
 class Grid:
-    """The pixels of a batch of square images, on the device, tile by tile (see ``rays.TILE``).
+    """The pixels of a batch of square images, on the device, tile by tile (see ``TILE``).
 
     ``size``, ``rows``: the resolution as opaque numbers, so that another one compiles no new
     kernel. ``view``, ``column``, ``row``: of every pixel. Made once and reused by every step.
     """
 
-    def __init__(self, views: int, resolution: int) -> None:
-        self.views = views
-        self.resolution = resolution
-        self.size = dr.opaque(mi.Float, resolution)
-        self.rows = dr.opaque(mi.UInt32, resolution)
-        self.view, self.column, self.row = rays.pixel_grid(views, resolution)
+    views: int
+    resolution: int
+    size: mi.Float = field(init=False)
+    rows: mi.UInt32 = field(init=False)
+    view: mi.UInt32 = field(init=False)
+    column: mi.UInt32 = field(init=False)
+    row: mi.UInt32 = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.size = dr.opaque(mi.Float, self.resolution)
+        self.rows = dr.opaque(mi.UInt32, self.resolution)
+        self.view, self.column, self.row = pixel_grid(self.views, self.resolution)
         dr.eval(self.view, self.column, self.row)
         self._finer: dict[int, Grid] = {}
 
@@ -38,6 +52,39 @@ class Grid:
     def pixels(self) -> int:
         """Pixels of the whole batch."""
         return self.views * self.resolution * self.resolution
+
+    @property
+    def index(self) -> mi.UInt32:
+        """Index in the batch of every pixel: (view, row, column), row major."""
+        return (self.view * self.rows + self.row) * self.rows + self.column
+
+
+@dataclass(frozen=True, eq=False)
+class Batch:
+    """From where images are seen, and their pixels. ``records``: see ``Views.records``."""
+
+    records: mi.Float
+    grid: Grid
+
+
+def pixel_grid(views: int, resolution: int) -> tuple[mi.UInt32, mi.UInt32, mi.UInt32]:
+    """(view, column, row) of every pixel of a batch, tile by tile."""
+    padded = -(-resolution // TILE)
+    i = dr.arange(mi.UInt32, views * padded * padded * TILE * TILE)
+    inside = i & (TILE * TILE - 1)
+    tile = i // (TILE * TILE)
+    view = tile // (padded * padded)
+    tile -= view * (padded * padded)
+    column = (tile % padded) * TILE + (inside & (TILE - 1))
+    row = (tile // padded) * TILE + inside // TILE
+    if resolution % TILE == 0:
+        return view, column, row
+    keep = dr.compress((column < resolution) & (row < resolution))
+    return (
+        dr.gather(mi.UInt32, view, keep),
+        dr.gather(mi.UInt32, column, keep),
+        dr.gather(mi.UInt32, row, keep),
+    )
 
 
 def pixel_index(samples: Samples, resolution: mi.UInt32) -> mi.UInt32:

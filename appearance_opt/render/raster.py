@@ -16,11 +16,12 @@ import drjit as dr
 import mitsuba as mi
 
 from appearance_opt import backend
-from appearance_opt.render import rays
-from appearance_opt.render.rays import MISS, Samples
+from appearance_opt.render.camera import camera_of
+from appearance_opt.render.passing import MISS
+from appearance_opt.render.samples import Samples
 
 if TYPE_CHECKING:
-    from appearance_opt.render.pixels import Grid
+    from appearance_opt.render.pixels import Batch, Grid
     from appearance_opt.render.surface import Surface
 
 MOST_PER_PIXEL = 4
@@ -44,46 +45,33 @@ def drawing_is_faster(surface: Surface, grid: Grid) -> bool:
     return mi.variant() == backend.CPU and triangles <= MOST_PER_PIXEL * grid.resolution**2
 
 
-def visible(
-    vertices: mi.Float,
-    faces: mi.UInt32,
-    records: mi.Float,
-    view: mi.UInt32,
-    column: mi.UInt32,
-    row: mi.UInt32,
-    dx: mi.Float,
-    dy: mi.Float,
-    size: mi.Float,
-    rows: mi.UInt32,
-    views: int,
-    pixels: int,
-    culled: mi.Bool | None = None,
+def draw_grid(
+    surface: Surface, batch: Batch, dx: mi.Float, dy: mi.Float
 ) -> tuple[Samples, mi.Float]:
-    """What the surface shows at the offset (dx, dy) in pixels (view, column, row), and its depth
-    (see ``rays.trace_depth``). ``vertices``, ``faces``: packets of ``Surface``; ``size``, ``rows``:
-    see ``Grid``; ``pixels`` of all ``views``; ``culled``: see ``Surface``. Of triangles at exactly
-    the same depth the first is seen."""
-    projected = _project(vertices, records, views, size)
+    """What the surface shows at the offset (dx, dy) in every pixel, and its depth (see
+    ``rays.trace_grid``). Of triangles at exactly the same depth the first is seen."""
+    grid = batch.grid
+    projected = _project(surface.vertices, batch)
     dr.eval(projected)
-    image = _draw(projected, faces, views, rows, pixels, dx, dy, culled)
+    image = _draw(projected, surface, grid, dx, dy)
     dr.eval(image)
-    nearest = dr.gather(mi.UInt64, image, (view * rows + row) * rows + column)
+    nearest = dr.gather(mi.UInt64, image, grid.index)
     triangle = mi.UInt32(nearest & 0xFFFFFFFF)
     depth = dr.reinterpret_array(mi.Float, mi.UInt32(nearest >> 32))
-    samples = Samples(view, mi.Float(column) + dx, mi.Float(row) + dy, triangle)
+    samples = Samples(grid.view, mi.Float(grid.column) + dx, mi.Float(grid.row) + dy, triangle)
     return samples, dr.select(triangle != MISS, depth, dr.inf)
 
 
-def _project(vertices: mi.Float, records: mi.Float, views: int, size: mi.Float) -> mi.Float:
+def _project(vertices: mi.Float, batch: Batch) -> mi.Float:
     """(views * V * 4) packets: position in pixels (x, y) times depth, depth, 0."""
-    count = dr.width(vertices) // 8
+    count, views = dr.width(vertices) // 8, batch.grid.views
     i = dr.arange(mi.UInt32, views * count)
     view = i // count
     p = dr.gather(mi.ArrayXf, vertices, i - view * count, shape=(8, views * count))
-    camera = rays.camera_of(records, view)
+    camera = camera_of(batch.records, view)
     v = mi.Point3f(p[0], p[1], p[2]) - camera.eye
     depth = dr.dot(v, camera.forward)
-    half = 0.5 * size
+    half = 0.5 * batch.grid.size
     scale = half / dr.squared_norm(camera.right)
     x = dr.fma(dr.dot(v, camera.right), scale, half * depth)
     y = dr.fma(dr.dot(v, camera.down), scale, half * depth)
@@ -93,17 +81,11 @@ def _project(vertices: mi.Float, records: mi.Float, views: int, size: mi.Float) 
 
 
 def _draw(
-    projected: mi.Float,
-    faces: mi.UInt32,
-    views: int,
-    rows: mi.UInt32,
-    pixels: int,
-    dx: mi.Float,
-    dy: mi.Float,
-    culled: mi.Bool | None,
+    projected: mi.Float, surface: Surface, grid: Grid, dx: mi.Float, dy: mi.Float
 ) -> mi.UInt64:
     """(pixels,) the bits of the nearest depth, above the number of the triangle there; ``NOTHING``
     where none is."""
+    faces, views, rows = surface.faces, grid.views, grid.rows
     triangles, stride = dr.width(faces) // 4, dr.width(projected) // 4 // views
     shares = max(1, min(16, LANES // max(views * triangles, 1)))
     count = views * triangles * shares
@@ -121,16 +103,16 @@ def _draw(
     v = [mi.Vector3f(q[0] - (x0 + dx) * q[2], q[1] - (y0 + dy) * q[2], q[2]) for q in p]
     edges = [dr.cross(v[1], v[2]), dr.cross(v[2], v[0]), dr.cross(v[0], v[1])]
     volume = dr.dot(v[0], edges[0])
-    if culled is not None:
+    if surface.culled is not None:
         # to the right, down and forward are axes like x, y and z: the volume of a front is negative
-        somewhere &= (volume < 0) | ~dr.gather(mi.Bool, culled, triangle)
+        somewhere &= (volume < 0) | ~dr.gather(mi.Bool, surface.culled, triangle)
     edges = [dr.select(volume < 0, -e, e) for e in edges]
     wide, high = x1 - x0, y1 - y0
     slack = [
         -SLACK * (dr.abs(e.x) * (wide + 1) + dr.abs(e.y) * (high + 1) + dr.abs(e.z)) for e in edges
     ]
     whole, volume = edges[0] + edges[1] + edges[2], dr.abs(volume)
-    image = dr.full(mi.UInt64, NOTHING, pixels)
+    image = dr.full(mi.UInt64, NOTHING, grid.pixels)
 
     steep = [dr.select(e.x == 0, mi.Float(0), -1 / e.x) for e in edges]
 

@@ -15,23 +15,24 @@ or leave the image by far (``_candidates``).
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
 from appearance_opt.render import rays
+from appearance_opt.render.camera import camera_of, project
+from appearance_opt.render.edge_list import EdgeList
 from appearance_opt.render.freezing import traced
-from appearance_opt.render.rays import Samples
+from appearance_opt.render.samples import Samples
+from appearance_opt.render.surface import vertex_position
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
+    from appearance_opt.render.camera import Camera
+    from appearance_opt.render.drawn import Drawn
     from appearance_opt.render.freezing import Run
-    from appearance_opt.render.passing import Scene
-    from appearance_opt.render.pixels import Grid
+    from appearance_opt.render.pixels import Batch
 
 OFFSET = 1e-6
 """Distance of the two rays from the edge, in widths of the image: eight times the rounding of a
@@ -46,28 +47,6 @@ reject edges of grazing faces (0.002 costs 4 % bias)."""
 MAX_SAMPLES = 1 << 20
 """Silhouette points of a batch before they are tested for visibility; of longer silhouettes they
 lie farther apart, and each stands for more."""
-
-
-@dataclass
-class EdgeList:
-    """Edges of a mesh: packets (a, b, opposite vertex, other opposite vertex), ``count`` of them.
-    An edge with one face, or more than two, has b in place of the other opposite vertex: it counts
-    as a silhouette from everywhere.
-
-    ``around``: for walks over the mesh (see ``walkable``), packets (three vertices, 0, three edges,
-    0, three neighbours, 0) per face; edge k runs from vertex k to the next, and the neighbour lies
-    beyond it (the face itself where there is not exactly one).
-
-    ``sides``: for faces that are not to be seen from behind, sums of the following bits per edge;
-    None without any. Of the face with the first opposite vertex: 1 if it is culled, 2 if it runs
-    from a to b by its winding; of that with the other one: 4 and 8. Where an edge has more than two
-    faces none of them is culled here: some are seen.
-    """
-
-    packets: mi.UInt32
-    count: int
-    around: mi.UInt32 | None = None
-    sides: mi.UInt32 | None = None
 
 
 @dataclass
@@ -104,130 +83,75 @@ class EdgeSamples:
             self.length,
             pick(self.normal_x),
             pick(self.normal_y),
-            rays.keep(self.inside, index),
-            rays.keep(self.outside, index),
+            self.inside.keep(index),
+            self.outside.keep(index),
         )
 
 
-def edge_list(faces: NDArray, culled: NDArray | None = None) -> EdgeList:
-    """All edges of a welded mesh (F, 3). ``culled`` (F,): see ``Surface.culled``."""
-    low, high, opposite, order, heads, uses = _sorted_edges(faces)
-    second = np.minimum(heads + 1, len(low) - 1)
-    other = np.where(uses == 2, opposite[second], high[heads])
-    packets = np.stack([low[heads], high[heads], opposite[heads], other], axis=1).astype(np.uint32)
-    sides = None
-    if culled is not None:
-        corner, face = np.divmod(order, len(faces))
-        bits = np.where(culled[face], 1, 0) + np.where(faces[face, corner] == low, 2, 0)
-        bits = np.where(uses <= 2, bits[heads], 0) + np.where(uses == 2, 4 * bits[second], 0)
-        sides = mi.UInt32(bits.astype(np.uint32))
-    return EdgeList(mi.UInt32(packets.ravel()), len(heads), sides=sides)
+@dataclass
+class GatheredEdges:
+    """Edges of what is drawn: their numbers ``index`` and packets ``corners`` (see ``EdgeList``),
+    and their ends ``a`` and ``b``."""
+
+    index: mi.UInt32
+    corners: mi.ArrayXu
+    a: mi.Point3f
+    b: mi.Point3f
 
 
-def walkable(edges: EdgeList, faces: NDArray) -> EdgeList:
-    """The same edges of the same faces (F, 3), with what lies around each face."""
-    _, _, _, order, heads, uses = _sorted_edges(faces)
-    count = len(faces)
-    face, edge = order % count, np.repeat(np.arange(len(heads)), uses)
-    partner = np.where(uses == 2, 2 * heads + 1, 0)[edge] - np.arange(len(order))
-    beyond = np.where(uses[edge] == 2, face[np.clip(partner, 0, len(order) - 1)], face)
-    out = np.zeros((count, 3, 4), np.uint32)
-    out[:, 0, :3] = faces
-    out[face, 1, order // count] = edge
-    out[face, 2, order // count] = beyond
-    return replace(edges, around=mi.UInt32(out.ravel()))
+def gather_edges(drawn: Drawn, index: mi.UInt32, active: mi.Bool | bool = True) -> GatheredEdges:
+    """The edges of the given numbers; differentiable in the vertices."""
+    edges = edges_of(drawn)
+    corners = dr.gather(mi.ArrayXu, edges.packets, index, active, shape=(4, dr.width(index)))
+    a, b = (vertex_position(drawn.surface, corners[k]) for k in (0, 1))
+    return GatheredEdges(index, corners, a, b)
 
 
-def _sorted_edges(faces: NDArray) -> tuple[NDArray, NDArray, NDArray, NDArray, NDArray, NDArray]:
-    """The three edges of all faces, those that coincide side by side: lower, higher and opposite
-    vertex (3 F), where each comes from (k F + face for the edge after corner k); and where each
-    edge begins in that list, and how often it is there (E)."""
-    corners = np.asarray(faces, np.int64)
-    start, end, opposite = (
-        corners.T.ravel(),
-        corners[:, [1, 2, 0]].T.ravel(),
-        corners[:, [2, 0, 1]].T.ravel(),
-    )
-    low, high = np.minimum(start, end), np.maximum(start, end)
-    order = np.lexsort((high, low))
-    low, high, opposite = low[order], high[order], opposite[order]
-    first = np.ones(len(low), bool)
-    first[1:] = (low[1:] != low[:-1]) | (high[1:] != high[:-1])
-    heads = np.flatnonzero(first)
-    return low, high, opposite, order, heads, np.diff(np.append(heads, len(low)))
+def edges_of(drawn: Drawn) -> EdgeList:
+    """The edges of what is drawn, which must have some."""
+    assert drawn.edges is not None, "silhouettes need the edges of what is drawn"
+    return drawn.edges
 
 
-def project(
-    camera: rays.Camera, p: mi.Point3f, resolution: mi.Float
-) -> tuple[mi.Float, mi.Float, mi.Float]:
-    """Pixel position (x, y) and depth along ``forward`` of world points. Differentiable in p."""
-    v = p - camera.eye
-    depth = dr.dot(v, camera.forward)
-    half = 0.5 * resolution
-    scale = half / (depth * dr.squared_norm(camera.right))
-    return (
-        dr.fma(dr.dot(v, camera.right), scale, half),
-        dr.fma(dr.dot(v, camera.down), scale, half),
-        depth,
-    )
-
-
-def silhouette_edges(
-    edges: EdgeList,
-    vertices: mi.Float,
-    records: mi.Float,
-    views: int,
-    resolution: mi.Float,
-    run: Run = traced,
-) -> tuple[mi.UInt32, mi.Float]:
+def silhouette_edges(drawn: Drawn, batch: Batch, run: Run = traced) -> tuple[mi.UInt32, mi.Float]:
     """(index, length): the silhouettes among all pairs (view * edges + edge), and their projected
-    lengths in pixels. ``vertices``: packets of ``Surface.vertices``."""
-    visible, length = run(_candidates, edges, vertices, records, views, resolution)
+    lengths in pixels."""
+    visible, length = run(_candidates, drawn, batch)
     index = dr.compress(visible)
     return index, dr.gather(mi.Float, length, index)
 
 
-def _candidates(
-    edges: EdgeList, vertices: mi.Float, records: mi.Float, views: int, resolution: mi.Float
-) -> tuple[mi.Bool, mi.Float]:
+def _candidates(drawn: Drawn, batch: Batch) -> tuple[mi.Bool, mi.Float]:
     """(silhouette and in view, projected length) of all pairs (view * edges + edge)."""
-    i = dr.arange(mi.UInt32, views * edges.count)
-    view = i // edges.count
-    edge = dr.gather(
-        mi.ArrayXu, edges.packets, i - view * edges.count, shape=(4, views * edges.count)
-    )
-    camera = rays.camera_of(records, view)
-    a, b = position(vertices, edge[0]), position(vertices, edge[1])
-    silhouette = is_silhouette(edges, i - view * edges.count, edge, a, b, vertices, camera)
-    ax, ay, az = project(camera, a, resolution)
-    bx, by, bz = project(camera, b, resolution)
+    count, size = edges_of(drawn).count, batch.grid.size
+    i = dr.arange(mi.UInt32, batch.grid.views * count)
+    view = i // count
+    edge = gather_edges(drawn, i - view * count)
+    camera = camera_of(batch.records, view)
+    silhouette = is_silhouette(drawn, edge, camera)
+    ax, ay, az = project(camera, edge.a, size)
+    bx, by, bz = project(camera, edge.b, size)
     length = dr.sqrt(dr.square(bx - ax) + dr.square(by - ay))
-    near = 0.01 * dr.norm(a - camera.eye)
+    near = 0.01 * dr.norm(edge.a - camera.eye)
     # an edge that leaves the image by far would take all the samples: it is dropped, as are those
     # that come too close to the camera to be projected
-    visible = silhouette & (az > near) & (bz > near) & (length > 0) & (length < 4 * resolution)
+    visible = silhouette & (az > near) & (bz > near) & (length > 0) & (length < 4 * size)
     return visible, length
 
 
-def is_silhouette(
-    edges: EdgeList,
-    index: mi.UInt32,
-    edge: mi.ArrayXu,
-    a: mi.Point3f,
-    b: mi.Point3f,
-    vertices: mi.Float,
-    camera: rays.Camera,
-) -> mi.Bool:
-    """Do both faces of the edges of numbers ``index`` (with packets ``edge``, from ``a`` to ``b``)
-    lie on one side of the plane through eye and edge? No winding is needed, but for culled faces:
-    what turns its back to the eye is not there."""
-    m = dr.cross(a - camera.eye, b - a)
-    side, other_side = (dr.dot(m, position(vertices, edge[k]) - a) for k in (2, 3))
-    boundary = edge[3] == edge[1]
+def is_silhouette(drawn: Drawn, edge: GatheredEdges, camera: Camera) -> mi.Bool:
+    """Do both faces of edges lie on one side of the plane through eye and edge? No winding is
+    needed, but for culled faces: what turns its back to the eye is not there."""
+    m = dr.cross(edge.a - camera.eye, edge.b - edge.a)
+    side, other_side = (
+        dr.dot(m, vertex_position(drawn.surface, edge.corners[k]) - edge.a) for k in (2, 3)
+    )
+    boundary = edge.corners[3] == edge.corners[1]
     out = boundary | (side * other_side > 0)
-    if edges.sides is None:
+    sides = edges_of(drawn).sides
+    if sides is None:
         return out
-    bits = dr.gather(mi.UInt32, edges.sides, index)
+    bits = dr.gather(mi.UInt32, sides, edge.index)
     gone, other_gone = _turned_away(bits, side), boundary | _turned_away(bits >> 2, other_side)
     return (out | (gone != other_gone)) & ~(gone & other_gone)
 
@@ -240,18 +164,11 @@ def _turned_away(bits: mi.UInt32, side: mi.Float) -> mi.Bool:
 
 
 def sample_edges(
-    scene: Scene,
-    edges: EdgeList,
-    vertices: mi.Float,
-    records: mi.Float,
-    grid: Grid,
-    density: float,
-    seed: int,
-    run: Run = traced,
+    drawn: Drawn, batch: Batch, density: float, seed: int, run: Run = traced
 ) -> EdgeSamples | None:
     """Visible silhouette points, about ``density`` per pixel of projected length; None if there are
     none. Stratified along the total length; ``seed`` moves the points within their strata."""
-    index, length = silhouette_edges(edges, vertices, records, grid.views, grid.size, run)
+    index, length = silhouette_edges(drawn, batch, run)
     if dr.width(index) == 0:
         return None
     # in single precision the rounding of sums of 1e5 pixels is a tenth of an edge of a fine mesh
@@ -266,19 +183,7 @@ def sample_edges(
         dr.opaque(mi.UInt32, dr.width(upper) - 1),
         dr.opaque(mi.Float64, total / count),
     )
-    points, visible = run(
-        _points,
-        scene,
-        edges,
-        vertices,
-        records,
-        grid.size,
-        grid.rows,
-        grid.views,
-        strata,
-        number,
-        dr.opaque(mi.UInt32, seed),
-    )
+    points, visible = run(_points, drawn, batch, strata, number, dr.opaque(mi.UInt32, seed))
     kept = dr.compress(visible)
     return points.keep(kept) if dr.width(kept) else None
 
@@ -295,32 +200,23 @@ class Strata:
 
 
 def _points(
-    scene: Scene,
-    edges: EdgeList,
-    vertices: mi.Float,
-    records: mi.Float,
-    resolution: mi.Float,
-    rows: mi.UInt32,
-    views: int,
-    strata: Strata,
-    number: mi.UInt32,
-    seed: mi.UInt32,
+    drawn: Drawn, batch: Batch, strata: Strata, number: mi.UInt32, seed: mi.UInt32
 ) -> tuple[EdgeSamples, mi.Bool]:
     """The points of the given numbers along the silhouettes, and whether each is visible."""
+    count, size, rows = edges_of(drawn).count, batch.grid.size, batch.grid.rows
     at = (mi.Float64(number) + mi.Float64(mi.sample_tea_float32(number, seed))) * strata.spacing
-    found = _first_not_below(strata.upper, at, strata.last, views * edges.count)
+    found = _first_not_below(strata.upper, at, strata.last, batch.grid.views * count)
     pair = dr.gather(mi.UInt32, strata.index, found)
     begin = dr.gather(mi.Float64, strata.upper, found - 1, found > 0)
     s = mi.Float((at - begin) / (dr.gather(mi.Float64, strata.upper, found) - begin))
     s = dr.select((s > 0) & (s < 1), s, 0.5)
-    view = pair // edges.count
-    edge = pair - view * edges.count
-    ends = dr.gather(mi.ArrayXu, edges.packets, edge, shape=(4, dr.width(edge)))
-    camera = rays.camera_of(records, view)
-    ax, ay, az = project(camera, position(vertices, ends[0]), resolution)
-    bx, by, bz = project(camera, position(vertices, ends[1]), resolution)
-    opposite = _seen_opposite(edges, edge, ends, vertices, camera)
-    ox, oy, oz = project(camera, position(vertices, opposite), resolution)
+    view = pair // count
+    edge = gather_edges(drawn, pair - view * count)
+    camera = camera_of(batch.records, view)
+    ax, ay, az = project(camera, edge.a, size)
+    bx, by, bz = project(camera, edge.b, size)
+    opposite = _seen_opposite(drawn, edge, camera)
+    ox, oy, oz = project(camera, vertex_position(drawn.surface, opposite), size)
     nx, ny = ay - by, bx - ax
     scale = dr.rsqrt(dr.fma(nx, nx, ny * ny))
     # outward: away from the third vertex of a face that is there; one behind the camera is
@@ -330,11 +226,11 @@ def _points(
     x, y = dr.lerp(ax, bx, s), dr.lerp(ay, by, s)
     depth = dr.rcp(dr.lerp(dr.rcp(az), dr.rcp(bz), s))
     hits = []
-    visible = (x > 0) & (y > 0) & (x < resolution) & (y < resolution)
+    visible = (x > 0) & (y > 0) & (x < size) & (y < size)
     for sign in (-OFFSET, OFFSET):
-        away = resolution * sign
+        away = size * sign
         hit, hit_depth = rays.trace_depth(
-            scene, records, view, dr.fma(nx, away, x), dr.fma(ny, away, y), resolution
+            drawn.scene, batch, view, dr.fma(nx, away, x), dr.fma(ny, away, y)
         )
         visible &= hit_depth > depth * (1 - DEPTH_SLACK)
         hits.append(hit)
@@ -342,20 +238,19 @@ def _points(
     visible &= hits[0].triangle != hits[1].triangle
     pixel = (view * rows + mi.UInt32(y)) * rows + mi.UInt32(x)
     return EdgeSamples(
-        edge, view, s, pixel, mi.Float(strata.spacing), nx, ny, hits[0], hits[1]
+        edge.index, view, s, pixel, mi.Float(strata.spacing), nx, ny, hits[0], hits[1]
     ), visible
 
 
-def _seen_opposite(
-    edges: EdgeList, index: mi.UInt32, ends: mi.ArrayXu, vertices: mi.Float, camera: rays.Camera
-) -> mi.UInt32:
+def _seen_opposite(drawn: Drawn, edge: GatheredEdges, camera: Camera) -> mi.UInt32:
     """The opposite vertex of a face of each silhouette that is not culled."""
-    if edges.sides is None:
-        return ends[2]
-    a = position(vertices, ends[0])
-    m = dr.cross(a - camera.eye, position(vertices, ends[1]) - a)
-    side = dr.dot(m, position(vertices, ends[2]) - a)
-    return dr.select(_turned_away(dr.gather(mi.UInt32, edges.sides, index), side), ends[3], ends[2])
+    sides = edges_of(drawn).sides
+    if sides is None:
+        return edge.corners[2]
+    m = dr.cross(edge.a - camera.eye, edge.b - edge.a)
+    side = dr.dot(m, vertex_position(drawn.surface, edge.corners[2]) - edge.a)
+    away = _turned_away(dr.gather(mi.UInt32, sides, edge.index), side)
+    return dr.select(away, edge.corners[3], edge.corners[2])
 
 
 def _first_not_below(
@@ -373,26 +268,11 @@ def _first_not_below(
     return found
 
 
-def motion(
-    edges: EdgeList,
-    vertices: mi.Float,
-    records: mi.Float,
-    samples: EdgeSamples,
-    resolution: mi.Float,
-) -> mi.Float:
+def motion(drawn: Drawn, batch: Batch, samples: EdgeSamples) -> mi.Float:
     """n . x(theta): the position of each point along its outward normal in pixels, differentiable
-    in ``vertices``. Only its derivative means anything."""
-    ends = dr.gather(mi.ArrayXu, edges.packets, samples.edge, shape=(4, dr.width(samples.edge)))
-    camera = rays.camera_of(records, samples.view)
-    ax, ay, _ = project(camera, position(vertices, ends[0]), resolution)
-    bx, by, _ = project(camera, position(vertices, ends[1]), resolution)
+    in the vertices. Only its derivative means anything."""
+    edge, camera = gather_edges(drawn, samples.edge), camera_of(batch.records, samples.view)
+    ax, ay, _ = project(camera, edge.a, batch.grid.size)
+    bx, by, _ = project(camera, edge.b, batch.grid.size)
     x, y = dr.lerp(ax, bx, samples.position), dr.lerp(ay, by, samples.position)
     return dr.fma(samples.normal_x, x, samples.normal_y * y)
-
-
-def position(vertices: mi.Float, index: mi.UInt32) -> mi.Point3f:
-    """Positions of vertices, from the packets of ``Surface.vertices``; differentiable."""
-    v = dr.gather(
-        mi.ArrayXf, vertices, index, mode=dr.ReduceMode.Expand, shape=(8, dr.width(index))
-    )
-    return mi.Point3f(v[0], v[1], v[2])

@@ -7,12 +7,14 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from appearance_opt.render import rays, silhouette
+from appearance_opt.render.camera import camera_of, project
+from appearance_opt.render.drawn import Drawn
 from appearance_opt.render.outlines import NOTHING
-from appearance_opt.render.pixels import Grid, pixel_index
-from appearance_opt.render.ray_lists import concat, join_arrays
-from appearance_opt.render.rays import MISS, Samples
-from appearance_opt.render.silhouette import EdgeList
+from appearance_opt.render.passing import MISS
+from appearance_opt.render.pixels import Batch, Grid, pixel_index
+from appearance_opt.render.samples import Samples, concat, join_arrays
+from appearance_opt.render.silhouette import edges_of, gather_edges, is_silhouette
+from appearance_opt.render.surface import vertex_position
 
 LONGEST = 32
 """Triangles between a sample and where a walk ends, at most."""
@@ -30,7 +32,7 @@ class Neighbours:
     def keep(self, index: mi.UInt32) -> Neighbours:
         """Those at the given positions of the list."""
         kept = dr.gather(mi.Bool, self.horizontal, index)
-        return Neighbours(rays.keep(self.front, index), rays.keep(self.back, index), kept)
+        return Neighbours(self.front.keep(index), self.back.keep(index), kept)
 
     def swapped(self) -> Neighbours:
         """Seen from the other side."""
@@ -70,7 +72,7 @@ def neighbours(hits: Samples, depth: mi.Float, fine: Grid) -> Neighbours | None:
     there = [k for k in (0, 1) if dr.width(found[k])]
     if not there:
         return None
-    one = concat([rays.keep(hits, found[k]) for k in there])
+    one = concat([hits.keep(found[k]) for k in there])
     horizontal = join_arrays([dr.full(mi.UInt32, k == 0, dr.width(found[k])) for k in there]) == 1
     dr.eval(one, horizontal)
     at = pixel_index(one, fine.rows)
@@ -91,15 +93,13 @@ def choose(condition: mi.Bool, one: Samples, other: Samples) -> Samples:
     return Samples(one.view, *fields)
 
 
-def walk(
-    edges: EdgeList, vertices: mi.Float, records: mi.Float, pairs: Neighbours, resolution: mi.Float
-) -> tuple[mi.UInt32, mi.UInt32]:
+def walk(drawn: Drawn, batch: Batch, pairs: Neighbours) -> tuple[mi.UInt32, mi.UInt32]:
     """(silhouette edge, triangle): where the lines from front to back samples leave the sheet that
     the front sample sees. From triangle to triangle, each left by the last of its edges along the
     line. Either a silhouette is met before the back sample, which is an edge if it is one of this
     kind of pair's (steeper than 45 degrees for those beside each other, flatter for the others), or
     the sheet covers the back sample, with that triangle; what is not there is MISS."""
-    around, packets = edges.around, edges.packets
+    around = edges_of(drawn).around
     front, back, horizontal = pairs.front, pairs.back, pairs.horizontal
     count = pairs.width
     start_along, line = (
@@ -112,9 +112,9 @@ def walk(
         face: mi.UInt32, walking: mi.Bool, steps: mi.UInt32, found: mi.UInt32, covers: mi.UInt32
     ) -> tuple:
         here = dr.gather(mi.ArrayXu, around, face, walking, shape=(12, count))
-        camera = rays.camera_of(records, front.view)
+        camera = camera_of(batch.records, front.view)
         projected = [
-            silhouette.project(camera, silhouette.position(vertices, here[k]), resolution)
+            project(camera, vertex_position(drawn.surface, here[k]), batch.grid.size)
             for k in range(3)
         ]
         walking &= (projected[0][2] > 0) & (projected[1][2] > 0) & (projected[2][2] > 0)
@@ -138,11 +138,9 @@ def walk(
         walking &= leaves != MISS
         covers = dr.select(walking & (furthest > 1), face, covers)
         walking &= furthest <= 1
-        edge = dr.gather(mi.ArrayXu, packets, leaves, walking, shape=(4, count))
-        a, b = silhouette.position(vertices, edge[0]), silhouette.position(vertices, edge[1])
-        ends = walking & silhouette.is_silhouette(
-            edges, dr.select(walking, leaves, 0), edge, a, b, vertices, camera
-        )
+        edge = gather_edges(drawn, leaves, walking)
+        edge.index = dr.select(walking, leaves, 0)
+        ends = walking & is_silhouette(drawn, edge, camera)
         found = dr.select(ends & ours, leaves, found)
         walking &= ~ends
         return dr.select(walking, beyond, face), walking, steps + 1, found, covers

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from appearance_opt.render.camera import Camera, direction
 from appearance_opt.render.math import at_least, at_most, clamp, unit
-from appearance_opt.render.rays import Camera, Samples, direction
+from appearance_opt.render.samples import Samples
 
 GRAZING_COSINE = 0.2
 """Mip levels are chosen as if no surface were seen at a flatter angle than this: isotropic lookups
@@ -135,6 +136,12 @@ def face_normal(surface: Surface, triangle: mi.UInt32, active: mi.Bool) -> mi.Ve
         )
         p.append(mi.Point3f(row[0], row[1], row[2]))
     return dr.cross(p[1] - p[0], p[2] - p[0])
+
+
+def vertex_position(surface: Surface, index: mi.UInt32) -> mi.Point3f:
+    """Positions of vertices; differentiable."""
+    v = _packet(surface.vertices, index, 8)
+    return mi.Point3f(v[0], v[1], v[2])
 
 
 def _triangle(surface: Surface, triangle: mi.UInt32) -> tuple[mi.ArrayXu, list]:

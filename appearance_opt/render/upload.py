@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import drjit as dr
@@ -10,6 +11,7 @@ import numpy as np
 
 from appearance_opt import backend
 from appearance_opt.render.passing import Half, SidedScene
+from appearance_opt.render.surface import Surface
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -19,6 +21,47 @@ if TYPE_CHECKING:
 ACROSS = (0.48, 0.65, 0.59)
 """Single-sided faces are told apart by the sign of the component of their normals along this
 direction, which hardly any plane contains."""
+
+
+@dataclass(frozen=True)
+class MeshArrays:
+    """A triangle mesh on the host, as it is uploaded.
+
+    ``positions``, ``normals`` (V, 3); ``faces`` (F, 3) into them. ``uvs`` (R, 2), ``tangents``
+    (R, 4) with the handedness last, and the indices ``corners`` (F, 3) into both, None where they
+    equal ``faces``; ``colors`` (V, 4) linear, with alpha. ``material`` (F,): its index.
+    ``culled`` (F,): faces that are not to be seen from behind (see ``asset.sides.culled``). What is
+    None is not there.
+    """
+
+    positions: NDArray[np.float32]
+    normals: NDArray[np.float32]
+    faces: NDArray[np.int32]
+    uvs: NDArray[np.float32] | None = None
+    tangents: NDArray[np.float32] | None = None
+    corners: NDArray[np.int32] | None = None
+    colors: NDArray[np.float32] | None = None
+    material: NDArray[np.int32] | int = 0
+    culled: NDArray[np.bool_] | None = None
+
+
+def surface_of(mesh: MeshArrays) -> Surface:
+    """The mesh, ready to be shaded."""
+    frames = None
+    if mesh.uvs is not None and mesh.tangents is None:
+        frames = packets(2, mesh.uvs)
+    elif mesh.uvs is not None and mesh.tangents is not None:
+        zeros = np.zeros(len(mesh.uvs))
+        frames = packets(8, mesh.uvs, mesh.tangents[:, 3], zeros, mesh.tangents[:, :3])
+    return Surface(
+        faces=index_packets(mesh.faces, mesh.material),
+        vertices=packets(8, mesh.positions, np.zeros(len(mesh.positions)), mesh.normals),
+        corners=None if mesh.corners is None else index_packets(mesh.corners),
+        frames=frames,
+        colors=None if mesh.colors is None else packets(4, mesh.colors),
+        has_tangents=mesh.tangents is not None,
+        culled=None if mesh.culled is None else mi.Bool(mesh.culled),
+    )
 
 
 def scene_of(positions: NDArray, faces: NDArray, culled: NDArray | None = None) -> Scene:

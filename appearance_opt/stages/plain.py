@@ -12,9 +12,11 @@ from appearance_opt.asset.packing import EMISSION
 from appearance_opt.asset.types import linear_to_srgb
 from appearance_opt.latent.texels import NORMALS
 from appearance_opt.reference.pool import check_images
-from appearance_opt.render.deferred import Grid, render_image
 from appearance_opt.render.display import display
+from appearance_opt.render.drawn import Drawn
+from appearance_opt.render.images import render_image
 from appearance_opt.render.material import COLORS
+from appearance_opt.render.pixels import Batch, Grid
 from appearance_opt.views import VALIDATION
 
 if TYPE_CHECKING:
@@ -188,8 +190,8 @@ class Pictures:
         return float(10 * np.log10(after / before))
 
     def _drawn(self, maps: Mapping[str, NDArray | float]) -> NDArray[np.float32]:
-        model, grid = self._model, Grid(VIEWS, self._resolution)
+        model, batch = self._model, Batch(self._views.records(), Grid(VIEWS, self._resolution))
         layer = self._codec.layer(self._codec.encode(maps))
-        surface, records = model.surface(model.posed()), self._views.records()
-        image = render_image(model.scene, surface, model.maps(layer), records, grid, SAMPLES)
+        drawn = Drawn(model.scene, model.surface(model.posed()), model.maps(layer))
+        image = render_image(drawn, batch, SAMPLES)
         return display(np.array(image).reshape(VIEWS, self._resolution, self._resolution, 4))

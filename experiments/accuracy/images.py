@@ -14,7 +14,7 @@ from appearance_opt.asset import Asset, load
 from appearance_opt.asset.types import Mesh, Texture, linear_to_srgb
 from appearance_opt.placement import Placement
 from appearance_opt.reference.mesh import MeshReference
-from appearance_opt.render.pixels import Grid
+from appearance_opt.render.pixels import Batch, Grid
 from appearance_opt.stages.parts import split
 from appearance_opt.views import Views, ViewSampler
 from experiments import mitsuba_peer
@@ -49,7 +49,8 @@ def compare(path: Path, resolution: int = 256, normal_maps: bool = False) -> Com
 def compare_asset(asset: Asset, views: Views, resolution: int) -> Comparison:
     """The first of the views. ``mitsuba_peer.register`` comes before."""
     # textures unfiltered on both sides: the samples are the filter
-    flat = MeshReference(asset).render_device(views.records(), Grid(1, resolution), SAMPLES, 1e-3)
+    batch = Batch(views.records(), Grid(1, resolution))
+    flat = MeshReference(asset).render_device(batch, SAMPLES, 1e-3)
     ours = np.array(flat).reshape(resolution, resolution, 4)[..., :3]
     scene = {"type": "scene", "light": mitsuba_peer.light(views, 0)}
     for k, mesh in enumerate(asset.meshes):

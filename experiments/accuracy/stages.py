@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from appearance_opt.fit import losses
 from appearance_opt.initial.sphere import sphere
 from appearance_opt.latent import mesh_ops
-from appearance_opt.render import brdf, coverage, rays, silhouette, surface
+from appearance_opt.render import brdf, camera, coverage, surface
 from experiments.accuracy.double import double_arrays, in_double
 
 COUNT = 200_000
@@ -55,9 +55,8 @@ class Precision:
         self.brdf, self.losses, self.mesh_ops, self.coverage = map(
             twin, (brdf, losses, mesh_ops, coverage)
         )
-        self.rays = twin(rays)
-        self.surface = twin(surface, direction=self.rays.direction)
-        self.silhouette = twin(silhouette)
+        self.camera = twin(camera)
+        self.surface = twin(surface, direction=self.camera.direction)
 
     def vector(self, rows: NDArray) -> Any:
         """(N, 3) to a device vector."""
@@ -185,16 +184,16 @@ def screen(one: Precision, two: Precision) -> list[Line]:
     angle, distance = rng.uniform(0, 2 * np.pi, COUNT), rng.uniform(-0.8, 0.8, COUNT)
     pixel, area = [], []
     for p in (one, two):
-        camera = SimpleNamespace(
+        seen_from = SimpleNamespace(
             eye=p.vector(eye),
             forward=p.vector(forward.astype(np.float32)),
             right=p.vector(right.astype(np.float32)),
             down=p.vector(down.astype(np.float32)),
         )
-        pixel.append(p.silhouette.project(camera, p.vector(points), p.float(512))[0])
+        pixel.append(p.camera.project(seen_from, p.vector(points), p.float(512))[0])
         n = p.scalar(np.cos(angle).astype(np.float32)), p.scalar(np.sin(angle).astype(np.float32))
         area.append(p.coverage.half_plane_area(*n, p.scalar(distance.astype(np.float32))))
-    out = [line("silhouette.project", "points within the view, 512 pixels", *pixel)]
+    out = [line("camera.project", "points within the view, 512 pixels", *pixel)]
     out.append(line("coverage.half_plane_area", "all lines", *area))
     return out + [hits(one, two, limit) for limit in (0.2, 0.01, 1e-4)]
 

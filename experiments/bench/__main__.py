@@ -113,7 +113,7 @@ def run_case(
     from appearance_opt.fit.step import Gradients, StepInputs, first_non_finite, step
     from appearance_opt.latent.laplacian import Laplacian
     from appearance_opt.reference.pool import ReferencePool, Targets
-    from appearance_opt.render.pixels import Grid
+    from appearance_opt.render.pixels import Batch, Grid
     from appearance_opt.render.quality import Quality
     from appearance_opt.stages.fitting import POOL_SAMPLES, point_width
     from experiments.bench.scene import set_up
@@ -128,7 +128,7 @@ def run_case(
         model, grid, Quality(point_width=width), LOSSES["log-srgb-l1"], {0: laplacian}
     )
     views = [sampler.draw(k, 4) for k in range(8)]
-    kept = [Targets(source.render_device(v.records(), grid, 1)) for v in views]
+    kept = [Targets(source.render_device(Batch(v.records(), grid), 1)) for v in views]
     pool = ReferencePool(
         source, sampler, 8, 4, resolution, POOL_SAMPLES, width, CommonOptions.reuse
     )
@@ -139,7 +139,7 @@ def run_case(
         if images == "as in a fit":
             v, target = pool.draw(k)
         if images == "live":
-            target = Targets(source.render_device(v.records(), grid, 1))
+            target = Targets(source.render_device(Batch(v.records(), grid), 1))
         background = np.full((4, 3), 0.3, np.float32)
         inputs = StepInputs(v, target, background, 0.01, 1.0, k, want_loss=k % LOSS_EVERY == 0)
         done = step(gradients, moments, inputs, first_non_finite)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 
 import drjit as dr
 import mitsuba as mi
@@ -19,9 +20,10 @@ from appearance_opt.fit import adam
 from appearance_opt.fit.losses import LOSSES, Target, compared_pixels, covered_loss, image_loss
 from appearance_opt.fit.model import POSITIONS, TEXELS, Shape
 from appearance_opt.render import gradient
+from appearance_opt.render.drawn import Drawn
 from appearance_opt.render.freezing import Frozen
 from appearance_opt.render.material import TexelLayer
-from appearance_opt.render.pixels import Grid
+from appearance_opt.render.pixels import Batch, Grid
 from appearance_opt.render.quality import Quality
 from appearance_opt.stages.fitting import point_width
 from experiments.bench.scene import set_up
@@ -62,15 +64,12 @@ def stages(resolution: int, maps: int) -> dict[str, float]:
     """Median milliseconds of each stage."""
     source, model, sampler = set_up(3000, 100_000, maps)
     grid, quality = Grid(4, resolution), Quality(point_width=point_width(resolution, maps))
-    records = sampler.draw(0, 4).records()
-    reference = source.render_device(records, grid, 1)
-    edges = model.topology.edges
+    batch = Batch(sampler.draw(0, 4).records(), grid)
+    reference = source.render_device(batch, 1)
     stopwatch = Stopwatch()
     timed = stopwatch.timed
 
-    timed(
-        "reference image, rendered live, 1 sample", lambda: source.render_device(records, grid, 1)
-    )
+    timed("reference image, rendered live, 1 sample", lambda: source.render_device(batch, 1))
 
     def rebuild() -> None:
         # a new array: Mitsuba skips parameters that are the same as before
@@ -83,37 +82,39 @@ def stages(resolution: int, maps: int) -> dict[str, float]:
     dr.enable_grad(positions)
     timed("normals and tangent bases", lambda: model.surface(positions).vertices)
     surface, layer = model.surface(positions), model.fitted_layer()
-    scene, all_maps = model.scene, model.maps(layer)
+    drawn = Drawn(model.scene, surface, model.maps(layer), model.topology.edges)
     loss, target = LOSSES["log-srgb-l1"], Target.of(reference, np.full((4, 3), 0.3))
     run = Frozen(model.fixed(), grid)
 
     def forward(quality: Quality) -> gradient.RenderedBatch:
-        return gradient.render(
-            scene, surface, all_maps, edges, records, grid, quality, 0, True, run
-        )
+        return gradient.render(drawn, batch, quality, 0, run, defer=True)
 
     timed("visibility alone", lambda: forward(Quality(0.0, 1, 1)).image)
     timed("visibility, silhouettes, averaged pixels", lambda: forward(quality).image)
-    batch = forward(quality)
+    rendered = forward(quality)
 
     def averaged() -> tuple:
-        pixels = compared_pixels(batch.image, target, batch.complete())
-        return run(image_loss, loss, target, batch.image, pixels, grid.pixels)
+        pixels = compared_pixels(rendered.image, target, rendered.complete())
+        return run(image_loss, loss, target, rendered.image, pixels, grid.pixels)
 
     timed("loss of averaged pixels", averaged)
     _, by_image = averaged()
 
     def backward() -> tuple:
-        return run(pulled_back, batch, model.shape(), layer, by_image)
+        return run(pulled_back, drawn, rendered, model.shape(), layer, by_image)
 
     def pulled_back(
-        batch: gradient.RenderedBatch, shape: Shape, layer: TexelLayer, by_image: mi.Float
+        drawn: Drawn,
+        rendered: gradient.RenderedBatch,
+        shape: Shape,
+        layer: TexelLayer,
+        by_image: mi.Float,
     ) -> tuple:
         shape, layer = model.track(shape, layer)
-        fresh, moving = model.maps(layer), model.surface(shape.positions)
-        terms = gradient.surrogate(batch, moving, fresh, edges, by_image)
+        moving = replace(drawn, surface=model.surface(shape.positions), maps=model.maps(layer))
+        terms = gradient.surrogate(rendered, moving, by_image)
         direct = gradient.direct(
-            batch, moving, fresh, lambda c, pixel: covered_loss(loss, target, c, pixel)
+            rendered, moving, lambda c, pixel: covered_loss(loss, target, c, pixel)
         )
         gradient.backward([*terms, direct])
         return dr.grad(shape.positions), dr.grad(layer.pyramid.texels)

@@ -19,7 +19,8 @@ import numpy as np
 from appearance_opt import backend
 from appearance_opt.render import raster, rays, upload
 from appearance_opt.render.freezing import Frozen
-from appearance_opt.render.pixels import Grid
+from appearance_opt.render.pixels import Batch, Grid
+from appearance_opt.render.surface import Surface
 from appearance_opt.views import ViewSampler
 from scenes.analytic import bumpy_sphere
 
@@ -35,9 +36,9 @@ def main() -> None:
     for triangles in TRIANGLES:
         mesh = bumpy_sphere(triangles).meshes[0]
         scene = upload.scene_of(mesh.positions, mesh.faces)
-        vertices, faces = upload.packets(8, mesh.positions), upload.index_packets(mesh.faces)
+        surface = Surface(upload.index_packets(mesh.faces), upload.packets(8, mesh.positions))
         for resolution in RESOLUTIONS:
-            traced, drawn, differ = compared(scene, vertices, faces, Grid(VIEWS, resolution))
+            traced, drawn, differ = compared(scene, surface, Grid(VIEWS, resolution))
             times = f"{traced:.1f} | {drawn:.1f} | {drawn / traced:.2f}"
             print(
                 f"| {len(mesh.faces)} | {VIEWS} x {resolution}² | {times} | {differ:.0e} |",
@@ -45,23 +46,17 @@ def main() -> None:
             )
 
 
-def compared(
-    scene: mi.Scene, vertices: mi.Float, faces: mi.UInt32, grid: Grid
-) -> tuple[float, float, float]:
+def compared(scene: mi.Scene, surface: Surface, grid: Grid) -> tuple[float, float, float]:
     """(median ms by rays, median ms drawn, part of the pixels in which they differ)."""
-    run, half = Frozen(vertices, faces), dr.opaque(mi.Float, 0.5)
-    views = [ViewSampler((0.0, 0.0, 0.0), 1.0).draw(k, VIEWS).records() for k in range(REPEATS)]
-    x, y = mi.Float(grid.column) + half, mi.Float(grid.row) + half
-    dr.eval(x, y)
-    at = grid.view, grid.column, grid.row, half, half, grid.size, grid.rows
+    run, half = Frozen(surface), dr.opaque(mi.Float, 0.5)
+    sampler = ViewSampler((0.0, 0.0, 0.0), 1.0)
+    views = [Batch(sampler.draw(k, VIEWS).records(), grid) for k in range(REPEATS)]
 
     def by_rays(k: int) -> mi.UInt32:
-        return run(rays.trace_depth, scene, views[k], grid.view, x, y, grid.size)[0].triangle
+        return run(rays.trace_grid, scene, views[k], half, half)[0].triangle
 
     def by_drawing(k: int) -> mi.UInt32:
-        return run(raster.visible, vertices, faces, views[k], *at, grid.views, grid.pixels)[
-            0
-        ].triangle
+        return run(raster.draw_grid, surface, views[k], half, half)[0].triangle
 
     both: list[tuple[Callable[[int], mi.UInt32], list[float]]] = [(by_rays, []), (by_drawing, [])]
     differ = []

@@ -20,8 +20,10 @@ from appearance_opt import backend
 from appearance_opt.fit.model import POSITIONS, Model, Rates
 from appearance_opt.initial.sphere import sphere
 from appearance_opt.latent.mesh import LatentMesh
-from appearance_opt.render import deferred, gradient, silhouette, silhouette_walk
-from appearance_opt.render.pixels import Grid
+from appearance_opt.render import gradient, silhouette, silhouette_walk
+from appearance_opt.render.drawn import Drawn
+from appearance_opt.render.images import render_image
+from appearance_opt.render.pixels import Batch, Grid
 from appearance_opt.render.quality import Quality
 from appearance_opt.views import ViewSampler
 from experiments.gradient_error.problems import split
@@ -55,28 +57,29 @@ def ball(splits: int) -> LatentMesh:
     )
 
 
-def estimated(model: Model, records: mi.Float, grid: Grid, quality: Quality) -> float:
+def estimated(model: Model, batch: Batch, quality: Quality) -> float:
     """dArea/dScale."""
     start = np.array(model.positions())
     positions = mi.Float(start)
     dr.enable_grad(positions)
-    surface, maps, edges = model.surface(positions), model.maps(None), model.topology.walkable
-    batch = gradient.render(model.scene, surface, maps, edges, records, grid, quality, 0)
-    by_image = np.zeros((grid.pixels, 4), np.float32)
+    surface, edges = model.surface(positions), model.topology.walkable
+    drawn = Drawn(model.scene, surface, model.maps(None), edges)
+    rendered = gradient.render(drawn, batch, quality, 0)
+    by_image = np.zeros((batch.grid.pixels, 4), np.float32)
     by_image[:, 3] = 1
-    gradient.backward(gradient.surrogate(batch, surface, maps, edges, mi.Float(by_image.ravel())))
+    gradient.backward(gradient.surrogate(rendered, drawn, mi.Float(by_image.ravel())))
     return float(np.array(dr.grad(positions)).astype(np.float64) @ start)
 
 
-def measured(model: Model, records: mi.Float, grid: Grid) -> float:
+def measured(model: Model, batch: Batch) -> float:
     """The same by differences."""
     start = np.array(model.positions())
     areas = []
     for scale in (1 + STEP, 1 - STEP):
         model.parameters[POSITIONS].value = mi.Float(start * scale)
         model.update_scene()
-        surface = model.surface(model.positions())
-        image = deferred.render_image(model.scene, surface, model.maps(None), records, grid, 64)
+        drawn = Drawn(model.scene, model.surface(model.positions()), model.maps(None))
+        image = render_image(drawn, batch, 64)
         areas.append(float(np.array(image).reshape(-1, 4)[:, 3].astype(np.float64).sum()))
     model.parameters[POSITIONS].value = mi.Float(start)
     model.update_scene()
@@ -85,20 +88,20 @@ def measured(model: Model, records: mi.Float, grid: Grid) -> float:
 
 def main() -> None:
     backend.select("cpu")
-    grid = Grid(4, RESOLUTION)
     records = ViewSampler((0.0, 0.0, 0.0), 1.0, seed=5).draw(1, 4).records()
+    batch = Batch(records, Grid(4, RESOLUTION))
     constants = {"red": 0.6, "green": 0.3, "blue": 0.2, "roughness": 0.5, "metalness": 0.2}
     columns = []
     for splits in (0, 1, 2):
         model = Model(ball(splits), constants, frozenset(("shape",)), Rates())
-        truth = measured(model, records, grid)
+        truth = measured(model, batch)
         column = [f"{len(model.mesh.faces):,} triangles"]
         for quality, change in SETTINGS.values():
             if change:
                 with mock.patch.object(*change):
-                    value = estimated(model, records, grid, quality)
+                    value = estimated(model, batch, quality)
             else:
-                value = estimated(model, records, grid, quality)
+                value = estimated(model, batch, quality)
             column.append(f"{100 * (value / truth - 1):+.1f} %")
         columns.append(column)
     print(

@@ -23,8 +23,9 @@ from appearance_opt.fit.step import Gradients, StepInputs
 from appearance_opt.initial.sphere import sphere
 from appearance_opt.latent.texels import TexelCodec
 from appearance_opt.reference.pool import Targets
-from appearance_opt.render.deferred import render_image
-from appearance_opt.render.pixels import Grid
+from appearance_opt.render.drawn import Drawn
+from appearance_opt.render.images import render_image
+from appearance_opt.render.pixels import Batch, Grid
 from appearance_opt.render.quality import Quality
 from appearance_opt.views import ViewSampler
 from experiments.gradient_error.metrics import error_of
@@ -96,7 +97,7 @@ def measure(scene: str, size: int, resolution: int) -> list[str]:
         Grid(1, resolution),
         ViewSampler((0.0, 0.0, 0.0), 1.0, seed=2, light_spread=40.0).draw(0, 1),
     )
-    records = views.records()
+    batch = Batch(views.records(), grid)
     parameter = model.parameters[TEXELS]
     start = np.array(parameter.value)
     behind = np.array(BACKGROUND)
@@ -105,9 +106,8 @@ def measure(scene: str, size: int, resolution: int) -> list[str]:
         parameter.value = mi.Float(stored)
         with dr.suspend_grad():
             surface, layer = model.surface(model.positions()), model.fitted_layer()
-            flat = render_image(
-                model.scene, surface, model.maps(layer), records, grid, SAMPLES, SAMPLES**-0.5
-            )
+            drawn = Drawn(model.scene, surface, model.maps(layer))
+            flat = render_image(drawn, batch, SAMPLES, SAMPLES**-0.5)
         pixels = np.array(flat).reshape(-1, 4).astype(np.float64)
         return pixels[:, :3] + (1 - pixels[:, 3:]) * behind
 

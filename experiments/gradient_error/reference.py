@@ -18,9 +18,11 @@ from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter
 
 from appearance_opt.latent import mesh_ops
-from appearance_opt.render import brdf, deferred, material, rays, surface, upload
-from appearance_opt.render.deferred import shade
-from appearance_opt.render.rays import MISS
+from appearance_opt.render import brdf, lattice, material, rays, shading, surface, upload
+from appearance_opt.render.drawn import Drawn
+from appearance_opt.render.passing import MISS
+from appearance_opt.render.pixels import Batch, Grid
+from appearance_opt.render.shading import shade
 from experiments.gradient_error.problems import BACKGROUND, Problem, smooth_fields
 
 CACHE = Path("out/gradient_error/cache")
@@ -57,7 +59,7 @@ class Supersampler:
         self.problem = problem
         self.topology = problem.topology()
         self.colors = colors
-        self.records = problem.views.records()
+        self.batch = Batch(problem.views.records(), Grid(1, problem.resolution))
         self.scene = upload.scene_of(positions, problem.faces)
         self.parameters = mi.traverse(self.scene)
         self.move(positions)
@@ -68,14 +70,15 @@ class Supersampler:
         self.parameters["mesh.vertex_positions"] = flat
         self.parameters.update()
         with dr.suspend_grad():
-            self.surface = self.problem.surface(self.topology, flat, self.colors)
-            dr.eval(self.surface.vertices, self.surface.colors)
+            surface = self.problem.surface(self.topology, flat, self.colors)
+            dr.eval(surface.vertices, surface.colors)
+        self.drawn = Drawn(self.scene, surface, self.problem.maps)
 
     def image(self, pixels: NDArray, samples: int, half: int) -> NDArray[np.float64]:
         """Linear RGB over the background of the given pixels (P,), each the mean of ``samples``
         rays: (P, 3). ``half`` picks one of independent sets of sample positions."""
         per_pass = max(1, CHUNK // len(pixels))
-        offsets = rays.sub_pixel_offsets(samples)
+        offsets = lattice.sub_pixel_offsets(samples)
         total = np.zeros((len(pixels), 4))
         for start in range(0, samples, per_pass):
             total += self._pass(pixels, offsets[start : start + per_pass], half)
@@ -84,7 +87,6 @@ class Supersampler:
 
     def _pass(self, pixels: NDArray, offsets: NDArray, half: int) -> NDArray[np.float64]:
         n, count = len(pixels), len(offsets)
-        size = dr.opaque(mi.Float, self.problem.resolution)
         pixel, at = mi.UInt32(pixels.astype(np.uint32)), mi.Float(offsets.ravel())
         i = dr.arange(mi.UInt32, n * count)
         k = i // dr.opaque(mi.UInt32, count)
@@ -97,21 +99,14 @@ class Supersampler:
         shift_y = mi.sample_tea_float32(index, dr.opaque(mi.UInt32, 2 * half + 1))
         dx, dy = dr.gather(mi.Float, at, j) + shift_x, dr.gather(mi.Float, at, j + 1) + shift_y
         x, y = mi.Float(column) + dx - dr.floor(dx), mi.Float(row) + dy - dr.floor(dy)
-        hits = rays.trace(self.scene, self.records, dr.zeros(mi.UInt32, n * count), x, y, size)
+        hits = rays.trace(self.scene, self.batch, dr.zeros(mi.UInt32, n * count), x, y)
         dr.eval(hits, k)
         kept = dr.compress(hits.triangle != MISS)
         image = dr.zeros(mi.Float, 4 * n)
         if dr.width(kept):
-            hits, k = rays.keep(hits, kept), dr.gather(mi.UInt32, k, kept)
+            hits, k = hits.keep(kept), dr.gather(mi.UInt32, k, kept)
             with dr.suspend_grad():
-                c = shade(
-                    self.surface,
-                    self.problem.maps,
-                    self.records,
-                    hits,
-                    size,
-                    dr.opaque(mi.Float, 1 / 16),
-                )
+                c = shade(self.drawn, self.batch, hits, dr.opaque(mi.Float, 1 / 16))
             value = mi.ArrayXf([c.x, c.y, c.z, dr.full(mi.Float, 1, dr.width(kept))])
             dr.scatter_reduce(dr.ReduceOp.Add, image, value, k, mode=dr.ReduceMode.Local)
         return np.array(image).reshape(n, 4).astype(np.float64)
@@ -149,7 +144,7 @@ def truth(problem: Problem, loss: str, force: bool = False) -> Truth:
 
 def _sources() -> bytes:
     """Source code of everything that the reference's images depend on."""
-    modules = (rays, deferred, surface, material, brdf, mesh_ops)
+    modules = (rays, lattice, shading, surface, material, brdf, mesh_ops)
     return (
         b"".join(Path(str(m.__file__)).read_bytes() for m in modules) + Path(__file__).read_bytes()
     )
@@ -211,12 +206,7 @@ def _near(view: Supersampler) -> NDArray[np.int64]:
 def _vertices_to_test(problem: Problem, view: Supersampler) -> NDArray[np.int64]:
     """Up to ``VERTICES`` random vertices of triangles that the camera sees."""
     view.move(problem.positions)
-    n = problem.resolution
-    x = dr.tile(dr.arange(mi.Float, n), n) + 0.5
-    y = dr.repeat(dr.arange(mi.Float, n), n) + 0.5
-    hits = rays.trace(
-        view.scene, view.records, dr.zeros(mi.UInt32, n * n), x, y, dr.opaque(mi.Float, n)
-    )
+    hits, _ = rays.trace_grid(view.scene, view.batch)
     triangle = np.array(hits.triangle)
     seen = np.unique(problem.faces[np.unique(triangle[triangle != MISS])])
     return np.sort(np.random.default_rng(3).permutation(seen)[:VERTICES])

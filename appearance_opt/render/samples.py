@@ -1,4 +1,4 @@
-"""Lists of camera rays with their shares of the pixels."""
+"""Lists of camera rays, what they hit, and their shares of the pixels."""
 
 from __future__ import annotations
 
@@ -7,7 +7,28 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from appearance_opt.render.rays import Samples
+
+@dataclass
+class Samples:
+    """A list of M camera rays and what they hit.
+
+    ``view``: index into the batch; ``x``, ``y``: position in pixels, y down; ``triangle``: index or
+    ``MISS``. The pixel is floor(x), floor(y).
+    """
+
+    view: mi.UInt32
+    x: mi.Float
+    y: mi.Float
+    triangle: mi.UInt32
+
+    def keep(self, index: mi.UInt32) -> Samples:
+        """The samples at the given positions of the list."""
+        return Samples(
+            dr.gather(mi.UInt32, self.view, index),
+            dr.gather(mi.Float, self.x, index),
+            dr.gather(mi.Float, self.y, index),
+            dr.gather(mi.UInt32, self.triangle, index),
+        )
 
 
 @dataclass

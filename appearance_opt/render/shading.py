@@ -1,0 +1,43 @@
+"""The colour of samples: attributes -> material -> light.
+
+Differentiable in the surface's buffers and the texels; visibility is not (see ``boundary`` for its
+derivative).
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import drjit as dr
+import mitsuba as mi
+
+from appearance_opt.render import brdf, material
+from appearance_opt.render.camera import camera_of
+from appearance_opt.render.math import at_least
+from appearance_opt.render.surface import interpolate
+
+if TYPE_CHECKING:
+    from appearance_opt.render.drawn import Drawn
+    from appearance_opt.render.pixels import Batch
+    from appearance_opt.render.samples import Samples
+
+NEAREST_LIGHT = 1e-3
+"""Distance below which a light gets no brighter (the object's radius is 1 in a fit): a point light
+that touches a surface is infinitely bright there."""
+
+
+def shade(drawn: Drawn, batch: Batch, samples: Samples, width: mi.Float) -> mi.Color3f:
+    """Radiance towards the camera at each sample (all must be hits). Linear RGB. ``width``: width
+    of a sample in pixels, which selects the mip level."""
+    camera = camera_of(batch.records, samples.view)
+    hit = interpolate(drawn.surface, camera, samples, batch.grid.size, width)
+    sample = material.evaluate(drawn.maps, hit)
+    if sample.unlit is True:
+        return sample.base_color
+    normal = material.shading_normal(hit, sample)
+    to_light = camera.light - hit.position
+    squared_distance = at_least(dr.squared_norm(to_light), NEAREST_LIGHT**2)
+    to_light *= dr.rsqrt(squared_distance)
+    irradiance = camera.intensity / squared_distance
+    lit = brdf.reflect(sample, normal, hit.to_viewer, to_light) * irradiance
+    return lit if sample.unlit is False else dr.select(sample.unlit, sample.base_color, lit)
