@@ -6,7 +6,14 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from appearance_opt.asset import load, save
-    from appearance_opt.config import BakeOptions, SimplifyOptions, bake_options, simplify_options
+    from appearance_opt.config import (
+        BakeOptions,
+        JointOptions,
+        SimplifyOptions,
+        bake_options,
+        joint_options,
+        simplify_options,
+    )
     from appearance_opt.errors import (
         AppearanceError,
         BackendError,
@@ -28,6 +35,7 @@ _HOMES = {
     "BakeOptions": "appearance_opt.config",
     "DivergedError": "appearance_opt.errors",
     "InputError": "appearance_opt.errors",
+    "JointOptions": "appearance_opt.config",
     "ReferenceRenderError": "appearance_opt.errors",
     "SimplifyOptions": "appearance_opt.config",
     "bake": "appearance_opt.jobs.bake",
@@ -35,6 +43,7 @@ _HOMES = {
     "compare": "appearance_opt.jobs.compare",
     "inspect": "appearance_opt.jobs.inspect",
     "joint": "appearance_opt.jobs.joint",
+    "joint_options": "appearance_opt.config",
     "load": "appearance_opt.asset",
     "save": "appearance_opt.asset",
     "simplify": "appearance_opt.jobs.simplify",
@@ -47,6 +56,7 @@ __all__ = [
     "BakeOptions",
     "DivergedError",
     "InputError",
+    "JointOptions",
     "ReferenceRenderError",
     "SimplifyOptions",
     "bake",
@@ -54,6 +64,7 @@ __all__ = [
     "compare",
     "inspect",
     "joint",
+    "joint_options",
     "load",
     "save",
     "simplify",

@@ -12,7 +12,7 @@ from appearance_opt.asset import load, save
 from appearance_opt.asset.alpha import Share, count_kinds, coverage, kind_of
 from appearance_opt.asset.types import Asset, Material, Mesh, Texture, Volume
 from appearance_opt.asset.validate import repair
-from appearance_opt.cli import inspect
+from appearance_opt.cli import main
 
 SQUARE = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], np.float32)
 FACES = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
@@ -227,10 +227,13 @@ def test_many_names_are_counted() -> None:
     )
 
 
-def test_inspect_says_what_becomes_of_each(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+def test_inspect_says_what_becomes_of_each(
+    tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
     cards = [card(m, name=m.name) for m in (LEAF, SMOKE, PANE, Material("wall"))]
     save(Asset((*cards, card(LEAF, RIGHT))), tmp_path / "x.glb")
-    inspect(tmp_path / "x.glb")
+    monkeypatch.setattr("sys.argv", ["appearance-opt", "inspect", str(tmp_path / "x.glb")])
+    main()
     lines = [" ".join(line.split()) for line in capsys.readouterr().out.splitlines()]
     assert "opaque 2 meshes, 4 triangles: fitted" in lines
     assert "mask 1 mesh, 2 triangles: kept as it is" in lines

@@ -20,7 +20,7 @@ from appearance_opt.baking.closed_form import BakedMaps, Settings
 from appearance_opt.baking.closed_form import bake as closed_form
 from appearance_opt.baking.target_mesh import prepare, unwrap_asset
 from appearance_opt.baking.texel_points import TexelPoints
-from appearance_opt.config import bake_options, read_toml
+from appearance_opt.config import BakeOptions, bake_options, read_toml, with_values
 from appearance_opt.errors import InputError
 from appearance_opt.evaluate.metrics import compare_images
 from appearance_opt.fit.model import Model, Rates
@@ -140,7 +140,7 @@ def test_tilts_have_the_sign_that_engines_expect(tmp_path: Path) -> None:
     high = Asset((square(normal=tuple(tilt), n=4),), "high")
     files = {}
     for green in ("opengl", "directx"):
-        options = replace(CLOSED, maps=("normal",), green=green)
+        options = with_values(CLOSED, maps=("normal",), green=green)
         bake(high, low, tmp_path / f"{green}.glb", options, textures=tmp_path / green)
         files[green] = read(tmp_path / green / f"{green}_normal.png")
     gl, dx = files["opengl"].astype(int), files["directx"].astype(int)
@@ -232,7 +232,7 @@ def test_maps_that_are_not_asked_for_stay(tmp_path: Path, ball: Asset) -> None:
     pixels = np.full((4, 4, 3), 200, np.uint8)
     material = Material("own", roughness=0.25, base_color_texture=Texture(pixels, "srgb"))
     low = replace(ball, meshes=(replace(ball.meshes[0], material=material),))
-    result = bake(ball, low, None, replace(CLOSED, maps=("normal",))).asset.meshes[0].material
+    result = bake(ball, low, None, with_values(CLOSED, maps=("normal",))).asset.meshes[0].material
     assert result.base_color_texture is material.base_color_texture and result.roughness == 0.25
     assert result.orm_texture is None and result.normal_texture is not None
 
@@ -331,7 +331,7 @@ def test_align_finds_scale_and_place(ball: Asset, low_sphere: Asset) -> None:
     low, high = placed.bounds()
     np.testing.assert_allclose((low + high) / 2, 0, atol=0.01)
     result = bake(
-        Asset((apart,), "high"), Asset((shape,), "low"), None, replace(CLOSED, align=True)
+        Asset((apart,), "high"), Asset((shape,), "low"), None, with_values(CLOSED, align=True)
     )
     assert any("HIGH was scaled by" in n for n in result.notes) and result.missed_share == 0
 
@@ -395,7 +395,7 @@ def test_a_cage_that_reaches_nothing_is_refused(ball: Asset) -> None:
         InputError,
         match=r"of the rays found nothing of HIGH within 0\.0001 m: give a larger --cage",
     ):
-        bake(ball, low, None, replace(CLOSED, cage=1e-4))
+        bake(ball, low, None, with_values(CLOSED, cage=1e-4))
 
 
 @pytest.mark.parametrize(
@@ -427,12 +427,7 @@ def test_bake_as_a_user_would(ball: Asset, low_sphere: Asset, tmp_path: Path) ->
     (tmp_path / "job.toml").write_text(
         'texture-size = 64\nmaps = "normal,ao,displacement"\nbits = 16\nao-rays = 4\n'
     )
-    assert (
-        read_toml(tmp_path / "job.toml", frozenset(["texture_size", "maps", "bits", "ao_rays"]))[
-            "bits"
-        ]
-        == 16
-    )
+    assert read_toml(tmp_path / "job.toml", BakeOptions)["bits"] == 16
     command = [
         "bake",
         "high.glb",

@@ -202,8 +202,12 @@ def test_public_names_exist() -> None:
 
 def test_presets_files_and_overrides(tmp_path: Path) -> None:
     options = config.simplify_options("draft", ratio=0.1, budget="1.5m", fit="shape, normal")
-    assert (options.budget, options.fit, options.resolution) == (90.0, ("shape", "normal"), 192)
-    assert config.simplify_options("draft", ratio=0.1, steps=5).budget is None
+    assert (options.fit.budget, options.fit.parts, options.views.resolution) == (
+        90.0,
+        ("shape", "normal"),
+        192,
+    )
+    assert config.simplify_options("draft", ratio=0.1, steps=5).fit.budget is None
     (tmp_path / "a.toml").write_text("texture-size = 512\nrelative = false\n")
     assert config.read_toml(tmp_path / "a.toml") == {"texture_size": 512, "relative": False}
     with pytest.raises(InputError, match="did you mean 'texture-size'"):

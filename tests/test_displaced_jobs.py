@@ -16,7 +16,7 @@ from appearance_opt.asset.height import heights_of
 from appearance_opt.asset.types import Asset, Displacement, Texture
 from appearance_opt.asset.validate import validate
 from appearance_opt.baking.target_mesh import movable, prepare
-from appearance_opt.config import bake_options, simplify_options
+from appearance_opt.config import bake_options, joint_options, simplify_options
 from appearance_opt.errors import InputError
 from appearance_opt.fit import loop
 from appearance_opt.fit.loop import FitOptions, level_of
@@ -79,7 +79,7 @@ def test_levels_are_read_in_every_way_and_checked() -> None:
         options(subdivision="fine")
     with pytest.raises(InputError, match="together with --displacement"):
         simplify_options(triangles=9, subdivision=2)
-    with pytest.raises(InputError, match="together with --joint"):
+    with pytest.raises(InputError, match="an option of simplify, joint"):
         bake_options(subdivision=2)
     with pytest.raises(InputError, match="LOW keeps its shape"):
         bake_options(fit="shape")
@@ -263,7 +263,7 @@ def test_joint_bake_keeps_topology_and_texture_coordinates(
     bumpy: Asset, flat: SimplifyResult, tmp_path: Path
 ) -> None:
     save(flat.asset, tmp_path / "low.glb")
-    o = bake_options(joint=True, subdivision="2", samples=1, **QUICK)
+    o = joint_options(subdivision="2", samples=1, **QUICK)
     result = joint(bumpy, tmp_path / "low.glb", tmp_path / "out.usda", o)
     before, after = load(tmp_path / "low.glb").meshes[0], result.asset.meshes[0]
     assert len(after.faces) == len(before.faces) == flat.triangles

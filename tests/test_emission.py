@@ -113,7 +113,7 @@ def test_baked_maps_hold_it(glowing: Asset, joint: bool) -> None:
     if joint:
         from appearance_opt.jobs.joint import joint as bake_jointly
 
-        options = appearance_opt.bake_options("draft", joint=True, subdivision=(0,), **QUICK)
+        options = appearance_opt.joint_options("draft", subdivision=(0,), **QUICK)
         asset = bake_jointly(glowing, low, None, options).asset
     else:
         asset = appearance_opt.bake(

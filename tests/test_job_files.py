@@ -17,6 +17,7 @@ from appearance_opt.config import (
     BakeOptions,
     SimplifyOptions,
     bake_options,
+    joint_options,
     read_toml,
     simplify_options,
 )
@@ -160,13 +161,13 @@ def test_nonsense_in_a_job_file_is_refused(text: str, words: str, tmp_path: Path
 )
 def test_what_a_joint_bake_ignores_is_refused(values: dict) -> None:
     with pytest.raises(InputError):
-        bake_options(joint=True, **values)
+        joint_options(**values)
     assert isinstance(bake_options(**values), BakeOptions)
 
 
-def test_a_joint_bake_has_its_own_function(ball: Asset) -> None:
+def test_a_joint_bake_has_its_own_function() -> None:
     with pytest.raises(InputError, match=r"appearance_opt\.joint"):
-        appearance_opt.bake(ball, ball, None, bake_options(joint=True))
+        bake_options(joint=True)
     assert appearance_opt.joint.__module__ == "appearance_opt.jobs.joint"
 
 

@@ -12,7 +12,7 @@ import drjit as dr
 import pytest
 
 from appearance_opt.asset.types import Asset
-from appearance_opt.config import bake_options, simplify_options
+from appearance_opt.config import bake_options, joint_options, simplify_options
 from appearance_opt.jobs.bake import bake
 from appearance_opt.jobs.compare import compare
 from appearance_opt.jobs.joint import joint
@@ -35,8 +35,12 @@ def simplified(asset: Asset, out: Path, **values: object) -> Asset:
 
 def baked(asset: Asset, out: Path, **values: object) -> None:
     low = simplified(asset, out, steps=0)
-    run = joint if values.get("joint") else bake
-    run(asset, low, out / "y.glb", bake_options(**{**QUICK, **values}))
+    bake(asset, low, out / "y.glb", bake_options(**{**QUICK, **values}))
+
+
+def joined(asset: Asset, out: Path) -> None:
+    low = simplified(asset, out, steps=0)
+    joint(asset, low, out / "y.glb", joint_options(**QUICK, subdivision=(1,)))
 
 
 def veiled(asset: Asset) -> Asset:
@@ -58,7 +62,7 @@ JOBS: dict[str, Callable[[Asset, Path], object]] = {
         maps=("normal", "object-normal", "material", "displacement", "ao", "curvature"),
         ao_rays=4,
     ),
-    "a joint bake": lambda asset, out: baked(asset, out, joint=True, subdivision=(1,)),
+    "a joint bake": joined,
     "compared": lambda asset, out: compare(asset, asset, views=1, resolution=64),
     "compared, transparent": lambda asset, out: compare(veiled(asset), asset, resolution=64),
 }

@@ -162,7 +162,7 @@ def test_bakes_leave_them_alone(snow_globe: Asset) -> None:
 def test_joint_bakes_leave_them_alone(snow_globe: Asset) -> None:
     low = Asset((ball(1.1, GLASS, "pane", 6), ball(0.52, Material("low", BLUE), "low", 8)), "low")
     chosen = {k: v for k, v in QUICK.items() if k != "reallocate"}
-    options_ = appearance_opt.bake_options(**{**chosen, "joint": True, "subdivision": (1,)})
+    options_ = appearance_opt.joint_options(**{**chosen, "subdivision": (1,)})
     got = appearance_opt.joint(snow_globe, low, None, options_)
     for asset in (got.asset, got.start, got.shown):
         check_kept(asset, low)

@@ -12,7 +12,7 @@ import pytest
 from appearance_opt import bake, compare, simplify
 from appearance_opt.asset import Asset, Material, Mesh, Texture, load, save
 from appearance_opt.asset.types import srgb_to_linear
-from appearance_opt.config import BakeOptions, SimplifyOptions
+from appearance_opt.config import bake_options, simplify_options, with_values
 from appearance_opt.fit.losses import LOSSES
 from appearance_opt.fit.model import TEXELS, Model, Rates
 from appearance_opt.fit.step import Gradients
@@ -127,7 +127,7 @@ SMALL = {"steps": 4, "resolution": 64, "texture_size": 64, "pool": 8, "views": 2
 
 def test_an_unlit_asset_becomes_an_unlit_one(tmp_path: Path) -> None:
     asset = painted()
-    options = SimplifyOptions(ratio=0.3, reallocate=0, **SMALL)
+    options = simplify_options(ratio=0.3, reallocate=0, **SMALL)
     result = simplify(asset, tmp_path / "low.glb", options)
     material = load(tmp_path / "low.glb").meshes[0].material
     assert material.unlit
@@ -140,7 +140,7 @@ def test_an_unlit_asset_becomes_an_unlit_one(tmp_path: Path) -> None:
 def test_unlit_parts_among_lit_ones_pass_through(tmp_path: Path) -> None:
     lit = make_asset(16, 32).meshes[0]
     sign = ball(Material("sign", COLOR, unlit=True), 3.0)
-    options = SimplifyOptions(ratio=0.3, reallocate=0, **SMALL)
+    options = simplify_options(ratio=0.3, reallocate=0, **SMALL)
     result = simplify(Asset((lit, sign)), None, options)
     fitted, kept = result.asset.meshes
     assert (fitted.material.unlit, kept.material.unlit) == (False, True)
@@ -150,13 +150,13 @@ def test_unlit_parts_among_lit_ones_pass_through(tmp_path: Path) -> None:
 
 def test_what_is_baked_from_an_unlit_asset_is_unlit() -> None:
     high, low = painted(), make_asset(8, 16)
-    options = BakeOptions(
+    options = bake_options(
         maps=("base-color",), texture_size=64, steps=2, resolution=64, pool=8, views=2, cage=0.2
     )
     material = bake(high, low, None, options).asset.meshes[0].material
     assert material.unlit
     again = (
-        bake(make_asset(16, 32), painted(), None, replace(options, closed_form=True))
+        bake(make_asset(16, 32), painted(), None, with_values(options, closed_form=True))
         .asset.meshes[0]
         .material
     )

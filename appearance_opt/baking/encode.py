@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from appearance_opt.config import BakeOptions
+    from appearance_opt.options.baking import BakingOptions
 
 CLAMP: tuple[Wrap, Wrap] = ("clamp", "clamp")
 
@@ -61,7 +61,7 @@ def curvature_scale(maps: Mapping[str, NDArray], covered: NDArray) -> float:
 
 
 def material_change(
-    maps: Mapping[str, NDArray], options: BakeOptions, unlit: bool = False
+    maps: Mapping[str, NDArray], options: BakingOptions, unlit: bool = False
 ) -> Callable[[Material], Material]:
     """A function from LOW's materials to those of the result: what was baked replaces what was
     there. ``unlit``: is HIGH?"""
@@ -114,7 +114,11 @@ class LooseMap:
 
 
 def loose_files(
-    maps: Mapping[str, NDArray], covered: NDArray, missed: NDArray, options: BakeOptions, stem: str
+    maps: Mapping[str, NDArray],
+    covered: NDArray,
+    missed: NDArray,
+    options: BakingOptions,
+    stem: str,
 ) -> dict[str, bytes]:
     """Image files by name, and ``<stem>_maps.json``, which says what each holds: encoding, and for
     displacement and curvature the scale and the mid-level. Lengths in metres."""
@@ -152,7 +156,7 @@ HEIGHT = "scale * (texel - mid_level)"
 
 
 def _loose_maps(
-    maps: Mapping[str, NDArray], covered: NDArray, options: BakeOptions
+    maps: Mapping[str, NDArray], covered: NDArray, options: BakingOptions
 ) -> Iterator[LooseMap]:
     """The maps asked for, but the displacement."""
     if options.wants("base-color"):

@@ -6,13 +6,14 @@ from __future__ import annotations
 import logging
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from appearance_opt import backend
 from appearance_opt.asset import load, write
 from appearance_opt.asset.alpha import seen_through
+from appearance_opt.config import BakeOptions, resolve_options, with_values
 from appearance_opt.errors import DivergedError, InputError
 from appearance_opt.interrupts import Interrupts
 from appearance_opt.jobs.paths import Outputs
@@ -29,7 +30,7 @@ if TYPE_CHECKING:
     from appearance_opt.asset.types import Asset
     from appearance_opt.baking.closed_form import BakedMaps
     from appearance_opt.baking.target_mesh import Low
-    from appearance_opt.config import BakeOptions
+    from appearance_opt.config import JointOptions
     from appearance_opt.fit.loop import Progress
     from appearance_opt.reference.subject import Subject
     from appearance_opt.stages.fitting import Stopwatch
@@ -45,7 +46,7 @@ def bake(
     high: str | Path | Asset,
     low: str | Path | Asset,
     out: str | Path | None,
-    options: BakeOptions,
+    options: BakeOptions | None = None,
     *,
     report: str | Path | None = None,
     textures: str | Path | None = None,
@@ -53,10 +54,12 @@ def bake(
     variants: dict[str, str] | None = None,
     began: float | None = None,
     inputs: Iterable[str | Path] = (),
+    **values: Any,
 ) -> BakeResult:
     """Bake ``high`` to ``low`` (paths or assets) and write LOW with its new maps to ``out`` (None:
     do not write).
 
+    ``values``: options by flat key, instead of ``options`` or over them: ``closed_form=True``.
     ``report``: folder for pictures, metrics and report.html. ``textures``: folder for the maps as
     loose files; maps for which the format of ``out`` has no place are always written, by default to
     ``<out's stem>_maps``. ``inputs``: other files that must not be replaced. Raises
@@ -64,11 +67,8 @@ def bake(
     """
     from appearance_opt.stages.fitting import Stopwatch
 
-    if options.joint:
-        raise InputError(
-            "joint bakes have a function of their own, appearance_opt.joint, with another result"
-        )
     watch = Stopwatch(began, progress)
+    options = resolve_options(BakeOptions, options, values)
     outputs = Outputs.of(out, options, report=report, textures=textures)
     outputs.check()
     outputs.check_sources(high, low, *inputs)
@@ -115,7 +115,7 @@ def read_pair(
     high: str | Path | Asset,
     low: str | Path | Asset,
     outputs: Outputs,
-    options: BakeOptions,
+    options: BakeOptions | JointOptions,
     variants: dict[str, str] | None,
     watch: Stopwatch,
 ) -> tuple[Parts, Parts, str]:
@@ -137,13 +137,13 @@ def read_pair(
     )
 
 
-def load_low(source: str | Path | Asset, options: BakeOptions) -> Asset:
+def load_low(source: str | Path | Asset, options: BakeOptions | JointOptions) -> Asset:
     """LOW itself, or the file of that name with its vertices and texture coordinates as they
     are."""
     if not isinstance(source, (str, Path)):
         return source
-    given = {"missing_textures": options.missing_textures, "root": options.root}
-    return load(source, refine=options.refine, keep_layout=True, **given)  # type: ignore[arg-type]
+    given = {"missing_textures": options.asset.missing_textures, "root": options.asset.root}
+    return load(source, refine=options.asset.refine, keep_layout=True, **given)  # type: ignore[arg-type]
 
 
 class BakeJob:
@@ -155,7 +155,7 @@ class BakeJob:
         high_parts: Parts,
         low_parts: Parts,
         name: str,
-        options: BakeOptions,
+        options: BakeOptions | JointOptions,
         watch: Stopwatch,
         interrupts: Interrupts,
     ) -> None:
@@ -176,19 +176,21 @@ class BakeJob:
             *low_parts.describe_kept("of LOW stay as they are"),
         ]
         self.high = high_parts.whole
-        if options.align:
+        if options.baking.align:
             high, self.high = self._align(high_parts, low)
         check.check_place(high, low)
-        if options.unwrap:
-            low = unwrap_asset(low, options.texture_size)
+        if options.baking.unwrap:
+            low = unwrap_asset(low, options.texture.size)
         check.check_uvs(low, name)
         backend.select(options.device)
         self.low: Low = prepare(low)
-        if not options.unwrap:
+        if not options.baking.unwrap:
             check.check_overlap(self.low.mesh, name)
         watch.lap("check")
         self.placement = Placement.around(np.concatenate([high.points(), low.points()]))
-        self.subject = Subject.of_asset(high, options.seed, options.light, self.placement)
+        self.subject = Subject.of_asset(
+            high, options.views.seed, options.views.light, self.placement
+        )
         assert self.subject.survey is not None
         self.survey = self.subject.survey
         local = self.placement.relative_to(low.origin).to_local(self.low.mesh.positions)
@@ -223,7 +225,7 @@ class BakeJob:
             return self.subject
         points = np.concatenate([self.high.points(), low.points()])
         placement, o = Placement.around(points), self.options
-        sampler = views_around(placement.to_local(points), o.seed, o.light)
+        sampler = views_around(placement.to_local(points), o.views.seed, o.views.light)
         return replace(Subject.of_asset(self.high, placement=placement), sampler=sampler)
 
     def run(
@@ -267,7 +269,7 @@ class BakeJob:
             True,
             baked.covered,
         )
-        options = replace(self.options, fit=parts)
+        options = with_values(self.options, fit=parts)
         model, fitted, error = fit_start(
             self.subject.reference,
             self.subject.sampler,
@@ -290,29 +292,30 @@ class BakeJob:
     @property
     def cage(self) -> float | None:
         """``--cage`` in local units (see ``Placement``); None for the automatic one."""
-        return None if self.options.cage is None else self.options.cage / self.placement.scale
+        cage = self.options.baking.cage
+        return None if cage is None else cage / self.placement.scale
 
     def _settings(self):
         from appearance_opt.baking.closed_form import FIELDS, Settings
 
         o, scale = self.options, self.placement.scale
-        wanted = {n for n in FIELDS if o.wants(n)}
+        wanted = {n for n in FIELDS if o.baking.wants(n)}
         if not self.survey.emits and "emission" in wanted:
             wanted.remove("emission")
-            if "emission" in o.maps:
+            if "emission" in o.baking.maps:
                 self.notes.append("HIGH emits no light: there is no emission map")
-        if o.wants("base-color") or o.wants("orm"):
+        if o.baking.wants("base-color") or o.baking.wants("orm"):
             wanted.add("material")
         if self._fitted_parts():
             wanted |= {"material", "normal"}
         return Settings(
-            o.texture_size,
+            o.texture.size,
             tuple(n for n in FIELDS if n in wanted),
-            o.samples,
+            o.baking.samples,
             self.cage,
-            o.hit,  # type: ignore[arg-type]
-            o.ao_rays,
-            float("inf") if o.ao_distance is None else o.ao_distance / scale,
+            o.baking.hit,  # type: ignore[arg-type]
+            o.baking.ao_rays,
+            float("inf") if o.baking.ao_distance is None else o.baking.ao_distance / scale,
         )
 
     def _fitted_parts(self) -> tuple[str, ...]:
@@ -320,11 +323,11 @@ class BakeJob:
         not at all."""
         o = self.options
         if self.subject.unlit:
-            written = {"normal": False, "material": o.wants("base-color")}
+            written = {"normal": False, "material": o.baking.wants("base-color")}
         else:
-            both = o.wants("base-color") and o.wants("orm")
-            written = {"normal": o.wants("normal"), "material": both}
-        return () if o.closed_form else tuple(p for p in o.fit if written[p])
+            both = o.baking.wants("base-color") and o.baking.wants("orm")
+            written = {"normal": o.baking.wants("normal"), "material": both}
+        return () if o.baking.closed_form else tuple(p for p in o.fit.parts if written[p])
 
     def check_missed(self, baked: BakedMaps) -> None:
         """Raise InputError if most rays found nothing; a note if some did."""
@@ -349,9 +352,9 @@ class BakeJob:
         from appearance_opt.baking.encode import material_change
         from appearance_opt.baking.target_mesh import with_material
 
-        change = material_change(self._in_metres(maps), self.options, self.subject.unlit)
+        change = material_change(self._in_metres(maps), self.options.baking, self.subject.unlit)
         asset = with_material(self.low.asset, change)
-        if self.options.wants(
+        if self.options.baking.wants(
             "base-color"
         ):  # the map holds the whole colour: vertex colours would tint it again
             asset = replace(asset, meshes=tuple(replace(m, colors=None) for m in asset.meshes))
@@ -368,14 +371,16 @@ def _write_loose(
     from appearance_opt.baking.encode import loose_files
 
     placeless = (
-        options.wants("object-normal") or options.wants("curvature") or options.green == "directx"
+        options.baking.wants("object-normal")
+        or options.baking.wants("curvature")
+        or options.baking.green == "directx"
     )
-    placeless |= options.wants("ao") and not options.wants("orm")
-    placeless |= options.wants("displacement") and out.suffix.lower() == ".obj"
+    placeless |= options.baking.wants("ao") and not options.baking.wants("orm")
+    placeless |= options.baking.wants("displacement") and out.suffix.lower() == ".obj"
     if folder is None and not placeless:
         return
     target = out.with_name(out.stem + "_maps") if folder is None else folder
     for name, data in loose_files(
-        result.maps, result.covered, result.missed, options, out.stem
+        result.maps, result.covered, result.missed, options.baking, out.stem
     ).items():
         together.place(target / name).write_bytes(data)

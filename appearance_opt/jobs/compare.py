@@ -10,13 +10,12 @@ import numpy as np
 
 from appearance_opt import backend
 from appearance_opt.asset.alpha import kind_of
-from appearance_opt.config import DEVICES
+from appearance_opt.config import CompareOptions, resolve_options
 from appearance_opt.errors import InputError
 from appearance_opt.jobs.paths import Outputs
 from appearance_opt.placement import Placement
 
 if TYPE_CHECKING:
-    from appearance_opt.asset.companions import MissingTextures
     from appearance_opt.asset.types import Asset
     from appearance_opt.evaluate.comparison import Comparison
 
@@ -24,69 +23,52 @@ if TYPE_CHECKING:
 def compare(
     reference: str | Path | Asset,
     candidate: str | Path | Asset,
+    options: CompareOptions | None = None,
     *,
-    views: int = 12,
-    resolution: int = 384,
-    samples: int = 16,
-    seed: int = 0,
-    device: str = "auto",
     out: str | Path | None = None,
-    refine: int = 1,
-    missing_textures: MissingTextures = "error",
-    root: str | Path | None = None,
-    crease_angle: float | None = None,
     variants: dict[str, str] | None = None,
+    **values: Any,
 ) -> Comparison:
-    """Render both assets from ``views`` random cameras under random lights and measure the
-    difference. ``out``: folder for a report with pictures. ``refine``, ``missing_textures``,
-    ``root``, ``crease_angle``: see ``load``; ``variants``: of the reference. What is transparent is
-    drawn so (see ``render.layers``). Raises AppearanceError, also if one of the two shows
-    nothing."""
-    if device not in DEVICES:
-        raise InputError(f"--device {device}: choose from {', '.join(DEVICES)}")
-    if seed < 0:
-        raise InputError(f"--seed {seed}: must be 0 or more")
+    """Render both assets from random cameras under random lights and measure the difference.
+    ``values``: options by flat key, instead of ``options`` or over them: ``views=4``. ``out``:
+    folder for a report with pictures. ``variants``: of the reference. What is transparent is drawn
+    so (see ``render.layers``). Raises AppearanceError, also if one of the two shows nothing."""
+    options = resolve_options(CompareOptions, options, values)
     outputs = Outputs.of(None, report=out)
     outputs.check()
     outputs.check_sources(reference, candidate)
-    reading = {
-        "refine": refine,
-        "missing_textures": missing_textures,
-        "root": root,
-        "crease_angle": crease_angle,
-    }
     with outputs.held():
-        given = ((reference, {**reading, "variants": variants}), (candidate, reading))
-        return _compare(given, outputs, (views, resolution, samples, seed, device))
+        return _compare(reference, candidate, options, outputs, variants)
 
 
 def _compare(
-    both: tuple[
-        tuple[str | Path | Asset, dict[str, Any]], tuple[str | Path | Asset, dict[str, Any]]
-    ],
+    reference: str | Path | Asset,
+    candidate: str | Path | Asset,
+    options: CompareOptions,
     outputs: Outputs,
-    drawing: tuple[int, int, int, int, str],
+    variants: dict[str, str] | None,
 ) -> Comparison:
-    """``both``: each with how it is to be read; ``drawing``: views, resolution, samples, seed,
-    device."""
     from appearance_opt.asset import load
     from appearance_opt.asset.types import Asset
 
-    views, resolution, samples, seed, device = drawing
-    first, second = (a if isinstance(a, Asset) else load(a, **reading) for a, reading in both)
+    reading = options.asset.arguments()
+    first, second = (
+        asset if isinstance(asset, Asset) else load(asset, **{**reading, "variants": chosen})
+        for asset, chosen in ((reference, variants or reading["variants"]), (candidate, None))
+    )
     outputs.check_inputs(first, second)
     outputs.check_room(0, None)
-    backend.select(device)
+    backend.select(options.device)
     from appearance_opt.evaluate.comparison import compare_local
     from appearance_opt.views import MEASURED, views_around
 
     points = np.concatenate([first.points(), second.points()])
     placement = Placement.around(points)
-    sampler = views_around(placement.to_local(points), seed).held_out(MEASURED)
+    sampler = views_around(placement.to_local(points), options.seed).held_out(MEASURED)
     apart = _apart(first, second)
     in_one = placement.local(first), placement.local(second)
     try:
-        result = compare_local(*in_one, sampler, views, resolution, samples)
+        result = compare_local(*in_one, sampler, options.views, options.resolution, options.samples)
     except (
         InputError
     ) as error:  # of two small things far from each other, pictures may show neither

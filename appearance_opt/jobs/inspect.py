@@ -22,11 +22,11 @@ from appearance_opt.asset.alpha import (
 )
 from appearance_opt.asset.types import Contents, Texture
 from appearance_opt.asset.validate import Validation, repair_and_count
+from appearance_opt.config import InspectOptions, resolve_options
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from appearance_opt.asset.companions import MissingTextures
     from appearance_opt.asset.types import Asset, Material, Mesh
 
 LISTED = 12
@@ -148,24 +148,15 @@ class Inspection:
 
 def inspect(
     source: str | Path,
+    options: InspectOptions | None = None,
     *,
-    refine: int = 1,
     variants: dict[str, str] | None = None,
-    missing_textures: MissingTextures = "error",
-    root: str | Path | None = None,
-    crease_angle: float | None = None,
+    **values: Any,
 ) -> Inspection:
-    """What is in a file, and what is wrong with it. The options are those of ``load``. Raises
-    InputError."""
-    given = load(
-        source,
-        refine=refine,
-        variants=variants,
-        missing_textures=missing_textures,
-        root=root,
-        crease_angle=crease_angle,
-        mend=False,
-    )
+    """What is in a file, and what is wrong with it. ``values``: options by flat key, as those of
+    ``load``. Raises InputError."""
+    reading = resolve_options(InspectOptions, options, values).asset.arguments()
+    given = load(source, mend=False, **{**reading, "variants": variants or reading["variants"]})
     counts, asset = repair_and_count(given, str(source))
     low, high = asset.bounds()
     parts = separate_opaque(asset)

@@ -3,10 +3,10 @@ together."""
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+from appearance_opt.config import JointOptions, resolve_options, with_values
 from appearance_opt.interrupts import Interrupts
 from appearance_opt.jobs.paths import Outputs
 from appearance_opt.jobs.result import SimplifyResult
@@ -16,34 +16,33 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from appearance_opt.asset.types import Asset
-    from appearance_opt.config import BakeOptions
     from appearance_opt.fit.loop import Progress
     from appearance_opt.jobs.bake import BakeJob
     from appearance_opt.stages.fitting import Stopwatch
-
-LAPLACIAN = 0.25
-"""Weight of the Laplacian, as by default in a simplification."""
 
 
 def joint(
     high: str | Path | Asset,
     low: str | Path | Asset,
     out: str | Path | None,
-    options: BakeOptions,
+    options: JointOptions | None = None,
     *,
     report: str | Path | None = None,
     progress: Progress | None = None,
     variants: dict[str, str] | None = None,
     began: float | None = None,
     inputs: Iterable[str | Path] = (),
+    **values: Any,
 ) -> SimplifyResult:
     """Fit base shape, displacement, normals and material of ``low`` to ``high`` and write the
     result to ``out`` (None: do not write). LOW keeps its topology and its texture coordinates; each
-    kind of detail goes where it is represented best. ``inputs``: other files that must not be
-    replaced. Raises AppearanceError."""
+    kind of detail goes where it is represented best. ``values``: options by flat key, instead of
+    ``options`` or over them. ``inputs``: other files that must not be replaced. Raises
+    AppearanceError."""
     from appearance_opt.stages.fitting import Stopwatch
 
     watch = Stopwatch(began, progress)
+    options = resolve_options(JointOptions, options, values)
     outputs = Outputs.of(out, options, report=report)
     outputs.check()
     outputs.check_sources(high, low, *inputs)
@@ -55,7 +54,7 @@ def _fit_pair(
     high: str | Path | Asset,
     low: str | Path | Asset,
     outputs: Outputs,
-    options: BakeOptions,
+    options: JointOptions,
     progress: Progress | None,
     variants: dict[str, str] | None,
     watch: Stopwatch,
@@ -87,7 +86,7 @@ def _fit_pair(
 
 
 def _fit_job(
-    job: BakeJob, options: BakeOptions, progress: Progress | None, with_report: bool
+    job: BakeJob, options: JointOptions, progress: Progress | None, with_report: bool
 ) -> SimplifyResult:
     from appearance_opt.baking.closed_form import Settings, bake
     from appearance_opt.baking.target_mesh import movable
@@ -101,36 +100,32 @@ def _fit_job(
     light, with_kept = job.low_parts.fitted, job.low_parts.with_kept
     mesh = movable(job.mesh)
     drawn, displacement = bake_displacement(job.survey, mesh, options, job.cage)
-    found = bake(job.survey, drawn, Settings(options.texture_size, samples=options.samples))
+    found = bake(job.survey, drawn, Settings(options.texture.size, samples=options.baking.samples))
     job.check_missed(found)
-    maps = {
-        n: v for n, v in found.maps.items() if options.wants("normal") or not n.startswith("normal")
-    }
     start = Start(
         mesh,
-        {**select_told(job.subject.unlit, maps), **displacement},
+        {**select_told(job.subject.unlit, found.maps), **displacement},
         True,
         found.covered,
         options.levels(),
     )
     job.watch.lap("closed form")
-    parts = tuple(dict.fromkeys(("shape", *options.fit)))
+    parts = tuple(dict.fromkeys(("shape", *options.fit.parts)))
     model, fitted, error = fit_start(
         job.subject.reference,
         job.subject.sampler,
         start,
-        replace(options, fit=parts),
+        with_values(options, fit=parts),
         job.watch,
         interrupts=job.interrupts,
-        laplacian=LAPLACIAN,
+        laplacian=options.fit.laplacian,
         progress=progress,
         with_report=with_report,
     )
     exporter = Exporter(job.placement, light.origin, light.name)
     initial = Model(mesh, start.maps, frozenset(), Rates(), start.levels[-1:])
     final = clean_maps(model, start.known)
-    if options.wants("emission"):
-        final |= transfer_emission(job.survey, model.posed_mesh(), options.texture_size)
+    final |= transfer_emission(job.survey, model.posed_mesh(), options.texture.size)
     final = flatten_maps(model, final, start, job.subject.reference, job.subject.sampler, options)
     tessellated = {k: with_kept(a) for k, a in exporter.drawn(model, final).items()}
     before, after = len(job.survey.triangles.faces), len(mesh.faces)

@@ -66,7 +66,11 @@ class Outputs:
         textures: str | Path | None = None,
     ) -> Outputs:
         """From what a job was given. ``options``: do they ask for tessellated meshes?"""
-        levels = options.levels() if options is not None and options.write_tessellated else ()
+        levels = (
+            options.levels()
+            if options is not None and options.displacement.write_tessellated
+            else ()
+        )
         out, report, checkpoint, textures = (
             None if path is None else Path(path) for path in (out, report, checkpoint, textures)
         )
@@ -141,7 +145,7 @@ class Outputs:
     def check_room(self, triangles: int, options: CommonOptions | None) -> None:
         """Raise InputError if a result of so many triangles would not fit on the disks, as far as
         can be told."""
-        texels = 0 if options is None else options.texture_size**2
+        texels = 0 if options is None else options.texture.size**2
         need: list[tuple[Path, int]] = [(Path(tempfile.gettempdir()), 3 * texels)]
         for path, level in zip(self.results, (0, *self.levels), strict=False):
             size = BYTES_PER_TRIANGLE * triangles * 4**level + BYTES_PER_TEXEL * texels

@@ -5,11 +5,11 @@ from __future__ import annotations
 import logging
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from appearance_opt import __version__, backend
 from appearance_opt.asset import load, write
-from appearance_opt.config import CommonOptions, SimplifyOptions, with_values
+from appearance_opt.config import CommonOptions, SimplifyOptions, resolve_options, with_values
 from appearance_opt.digest import digest
 from appearance_opt.errors import InputError
 from appearance_opt.interrupts import Interrupts
@@ -38,7 +38,7 @@ CHECKPOINT_SECONDS = 10.0
 def simplify(
     source: str | Path | Asset,
     out: str | Path | None,
-    options: SimplifyOptions,
+    options: SimplifyOptions | None = None,
     *,
     report: str | Path | None = None,
     checkpoint: str | Path | None = None,
@@ -47,10 +47,12 @@ def simplify(
     variants: dict[str, str] | None = None,
     began: float | None = None,
     inputs: Iterable[str | Path] = (),
+    **values: Any,
 ) -> SimplifyResult:
     """Simplify ``source`` (a path or an asset) and write the result to ``out`` (None: do not
     write).
 
+    ``values``: options by flat key, instead of ``options`` or over them: ``triangles=3000``.
     ``report``: folder for pictures, metrics and report.html. ``checkpoint``: folder in which the
     state is kept every few seconds; with ``resume`` a run goes on from there. ``variants``: USD
     variant selections. ``began``: ``time.perf_counter()`` at which the time budget began, if before
@@ -62,10 +64,10 @@ def simplify(
     from appearance_opt.stages.fitting import Stopwatch
 
     watch = Stopwatch(began, progress)
+    options = resolve_options(SimplifyOptions, options, values)
     outputs = Outputs.of(out, options, report=report, checkpoint=checkpoint)
     outputs.check()
-    first = options.init if Path(options.init).suffix else None
-    outputs.check_sources(source, first, *inputs)
+    outputs.check_sources(source, options.start.file, *inputs)
     if resume and checkpoint is None:
         raise InputError("--resume needs --checkpoint DIR")
     with outputs.held(), Interrupts() as interrupts:
@@ -91,7 +93,8 @@ def _simplify(
     first = load_init(options)
     outputs.check_inputs(asset, first)
     outputs.check_room(
-        options.triangles or round((options.ratio or 1.0) * asset.triangle_count), options
+        options.start.triangles or round((options.start.ratio or 1.0) * asset.triangle_count),
+        options,
     )
     parts = split(asset, str(source) if isinstance(source, (str, Path)) else asset.name, "simplify")
     watch.lap("load")
@@ -115,7 +118,7 @@ def _simplify(
         raise result.error
     subject = run.subject
     if parts.kept:  # they may lie outside of what the fit's views show
-        subject = Subject.of_asset(parts.whole, options.seed, options.light)
+        subject = Subject.of_asset(parts.whole, options.views.seed, options.views.light)
     del run
 
     def write_report() -> None:
@@ -135,9 +138,9 @@ def write_result(result: SimplifyResult, out: Path, options: CommonOptions) -> N
 
     with publication() as together:
         write(result.asset, together.place(out))
-        if options.displaced:
+        if options.displacement.fitted:
             write_companion(result.asset, together.place(out))
-        if options.write_tessellated:
+        if options.displacement.write_tessellated:
             for level, asset in result.tessellated.items():
                 write(asset, together.place(level_path(out, level)))
 
@@ -148,20 +151,20 @@ def load_source(
     """``source`` itself, or the file of that name, read as the options say."""
     if not isinstance(source, (str, Path)):
         return source
-    given = {n: getattr(options, n) for n in ("missing_textures", "root", "crease_angle")}
-    return load(source, refine=options.refine, variants=variants, **given)  # type: ignore[arg-type]
+    arguments = options.asset.arguments()
+    return load(source, **{**arguments, "variants": variants or arguments["variants"]})
 
 
 def load_init(options: SimplifyOptions) -> Asset | None:
     """The asset that ``--init`` names; None if it names none. Its own maps are not used: it may
     lack them."""
-    if not Path(options.init).suffix:
+    if options.start.file is None:
         return None
     return load(
-        options.init,
-        refine=options.refine,
+        options.start.file,
+        refine=options.asset.refine,
         missing_textures="ignore",
-        root=options.root,
+        root=options.asset.root,
         keep_layout=True,
     )
 
@@ -201,16 +204,17 @@ class _Job:
             ),
         ]
         watch.begin(f"preparing {asset.triangle_count:,} triangles")
-        self.subject = Subject.of_asset(asset, options.seed, options.light)
+        self.subject = Subject.of_asset(asset, options.views.seed, options.views.light)
         watch.lap("reference")
         survey = require_survey(self.subject)
         single = survey.triangles.single
-        if options.init == "sphere" and "shape" in options.fit and not options.displaced:
+        alone = "shape" in options.fit.parts and not options.displacement.fitted
+        if options.start.init == "sphere" and alone:
             triangles = budget(options, asset.triangle_count)
             self.start = self._fit_shape(
                 lambda effort: grow_start(self.subject, options, triangles, effort)
             )
-        elif options.init in ("decimate", "sphere"):
+        elif options.start.init in ("decimate", "sphere"):
             triangles = budget(options, asset.triangle_count)
             left = seconds_left(options, watch, with_report)
             self.start = self._make_start(
@@ -222,7 +226,7 @@ class _Job:
                 first, self.subject.placement, asset.triangle_count, options, single
             )
             self.notes += notes
-            if options.relative is False and "shape" in options.fit and not options.displaced:
+            if options.fit.relative is False and alone:
                 self.start = self._fit_shape(
                     lambda effort: mend_start(self.subject, options, mesh, effort)
                 )
@@ -252,7 +256,7 @@ class _Job:
 
         o = self.options
         seconds = seconds_left(o, self.watch, self.with_report)
-        steps = 1000 if o.steps is None and seconds is None else o.steps
+        steps = 1000 if o.fit.steps is None and seconds is None else o.fit.steps
         share = None if seconds is None else SHARE * seconds
         effort = Effort(
             share, None if steps is None else round(SHARE * steps), self.progress, self.interrupts
@@ -282,8 +286,8 @@ class _Job:
             o,
             self.watch,
             interrupts=self.interrupts,
-            laplacian=o.laplacian,
-            relative=self.start.relative if o.relative is None else o.relative,
+            laplacian=o.fit.laplacian,
+            relative=self.start.relative if o.fit.relative is None else o.fit.relative,
             progress=self.progress,
             checkpointer=self.checkpointer,
             with_report=self.with_report,
@@ -296,12 +300,12 @@ class _Job:
         )
         begin = exporter.drawn(initial, self.start.maps)[initial.level]
         maps = clean_maps(model, self.start.known)
-        maps |= transfer_emission(require_survey(self.subject), model.posed_mesh(), o.texture_size)
+        maps |= transfer_emission(require_survey(self.subject), model.posed_mesh(), o.texture.size)
         maps = flatten_maps(
             model, maps, self.start, self.subject.reference, self.subject.sampler, o
         )
         result = exporter.base(model, maps)
-        tessellated = exporter.drawn(model, maps) if o.displaced else {}
+        tessellated = exporter.drawn(model, maps) if o.displacement.fitted else {}
         self.watch.lap("export")
         with_kept, triangles = self.parts.with_kept, len(self.start.mesh.faces)
         tessellated = {k: with_kept(a) for k, a in tessellated.items()}

@@ -62,7 +62,7 @@ def require_memory(triangles: int, options: CommonOptions) -> None:
     """Raise InputError with the numbers if tessellating ``triangles`` would exceed the memory that
     is free."""
     free = memory.available_memory()
-    if not options.displaced or free is None:
+    if not options.displacement.fitted or free is None:
         return
     counts = {level: triangles * 4**level for level in options.levels()}
     need = BYTES_AT_LEAST + BYTES_PER_TRIANGLE * sum(counts.values())
@@ -78,9 +78,9 @@ def gutter(triangles: int, options: CommonOptions) -> int:
     """Texels between the charts of a new atlas: two edges of the finest tessellation, for a vertex
     on the rim of a chart reads its displacement from texels on both sides, in coarser mip levels
     where its edges are longer."""
-    if not options.displaced:
+    if not options.displacement.fitted:
         return GUTTER
-    area = FILLED * options.texture_size**2 / (triangles * 4 ** max(options.levels()))
+    area = FILLED * options.texture.size**2 / (triangles * 4 ** max(options.levels()))
     return int(np.clip(np.ceil(2 * np.sqrt(area * 4 / 3**0.5)), GUTTER, MAX_GUTTER))
 
 
@@ -88,7 +88,7 @@ def map_size(mesh: LatentMesh, options: CommonOptions) -> int:
     """Texels per side of the displacement map: the power of two at which a texel is just not longer
     than half an edge of the finest tessellation, which is what its vertices read."""
     half_edge = float(np.sqrt(np.median(footprint(tessellate(mesh, max(options.levels())).mesh))))
-    return int(np.clip(2 ** np.ceil(np.log2(1 / max(half_edge, 1e-6))), 16, options.texture_size))
+    return int(np.clip(2 ** np.ceil(np.log2(1 / max(half_edge, 1e-6))), 16, options.texture.size))
 
 
 def flat_map(mesh: LatentMesh, options: CommonOptions) -> NDArray[np.float32]:

@@ -114,7 +114,7 @@ def fit_start(
     checkpointer: Checkpointer | None = None,
     with_report: bool = False,
 ) -> tuple[Model, FitResult, DivergedError | None]:
-    """Fit what ``options.fit`` names, from ``start``, within what is left of the budget on
+    """Fit what ``options.fit.parts`` names, from ``start``, within what is left of the budget on
     ``watch``.
 
     The model is left at its best state by held-out PSNR; so it is when the fit diverged, which is
@@ -123,18 +123,31 @@ def fit_start(
     """
     interrupts.protect()
     o = options
-    width = point_width(o.resolution, o.texture_size)
+    width = point_width(o.views.resolution, o.texture.size)
     pool = ReferencePool(
-        reference, sampler, o.pool, o.views, o.resolution, POOL_SAMPLES, width, o.reuse
+        reference,
+        sampler,
+        o.views.pool,
+        o.views.per_step,
+        o.views.resolution,
+        POOL_SAMPLES,
+        width,
+        o.views.reuse,
     )
     held_out = sampler.held_out(VALIDATION).draw(0, VALIDATION_VIEWS)
-    validation = Validation(reference, held_out, min(o.resolution, 256))
-    parts = frozenset(o.fit) | ({DISPLACEMENT} if o.displaced else set())
+    validation = Validation(reference, held_out, min(o.views.resolution, 256))
+    parts = frozenset(o.fit.parts) | ({DISPLACEMENT} if o.displacement.fitted else set())
     model = Model(start.mesh, start.maps, parts, Rates(), start.levels)
     quality, rates = fit_policy(
         validation.psnr(model), start.relative, start.grown, patience(o, watch, with_report)
     )
-    given = (o.position_rate, o.normal_rate, o.color_rate, o.material_rate, o.displacement_rate)
+    given = (
+        o.fit.position_rate,
+        o.fit.normal_rate,
+        o.fit.color_rate,
+        o.fit.material_rate,
+        o.displacement.rate,
+    )
     defaults = (rates.position, rates.normal, rates.base_color, rates.material, rates.displacement)
     model.set_rates(Rates(*(d if g is None else g for g, d in zip(given, defaults, strict=True))))
     watch.lap("set-up")
@@ -143,18 +156,18 @@ def fit_start(
         log.warning(
             "--budget %.0f s holds no more than set-up (%.0f s so far) and writing: the result is the start, "
             "without a fit",
-            o.budget,
+            o.fit.budget,
             watch.total,
         )
     fit_options = FitOptions(
-        steps=o.steps if seconds is not None or o.steps is not None else 1000,
+        steps=o.fit.steps if seconds is not None or o.fit.steps is not None else 1000,
         seconds=seconds,
-        loss=o.loss,
+        loss=o.fit.loss,
         laplacian=laplacian,
         relative=relative,
-        background=o.background_color(),
+        background=o.views.background_color(),
         quality=quality,
-        seed=o.seed,
+        seed=o.views.seed,
     )
     error = None
     try:
@@ -167,10 +180,10 @@ def fit_start(
 
 def seconds_left(options: CommonOptions, watch: Stopwatch, with_report: bool) -> float | None:
     """Seconds of the budget that are left for fitting; None without a budget."""
-    if options.budget is None:
+    if options.fit.budget is None:
         return None
     reserve = EXPORT_SECONDS + (REPORT_SECONDS if with_report else 0.0)
-    return max(options.budget - watch.total - reserve, 0.0)
+    return max(options.fit.budget - watch.total - reserve, 0.0)
 
 
 def point_width(resolution: int, texture_size: int) -> float:
@@ -200,7 +213,7 @@ LONG = (600, 40.0)  # docs/trials.md: rates
 def patience(options: CommonOptions, watch: Stopwatch, with_report: bool) -> float:
     """How long a fit will be, from 0 to 1 (as in ``LONG``, or longer)."""
     seconds = seconds_left(options, watch, with_report)
-    by_steps = 1.0 if options.steps is None else options.steps / LONG[0]
+    by_steps = 1.0 if options.fit.steps is None else options.fit.steps / LONG[0]
     return min(1.0, by_steps, 1.0 if seconds is None else seconds / LONG[1])
 
 

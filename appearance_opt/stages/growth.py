@@ -90,11 +90,15 @@ def grow_start(
     effort: Effort,
 ) -> tuple[Start, bool]:
     """(start, interrupted), grown from a sphere. Only images of the reference are used."""
-    texture = min(TEXTURE, options.texture_size)
+    texture = min(TEXTURE, options.texture.size)
     mesh = first_shape(triangles, subject.sampler, texture)
     maps = select_told(
         subject.unlit,
-        random_maps(texture, options.seed, options.normal_map and "normal" in options.fit),
+        random_maps(
+            texture,
+            options.views.seed,
+            options.texture.normal_map and "normal" in options.fit.parts,
+        ),
     )
     model, result = _fit_shape(subject, options, mesh, maps, 1.0, effort)
     likeness = to_asset(
@@ -105,7 +109,7 @@ def grow_start(
     positions, faces = decimate(grown.positions, grown.faces, triangles)
     if not len(faces):
         raise InputError("nothing is left of the grown mesh at that budget; ask for more triangles")
-    start = transfer_appearance(source, unwrap(positions, faces, options.texture_size), options)
+    start = transfer_appearance(source, unwrap(positions, faces, options.texture.size), options)
     return replace(start, grown=True), result.interrupted
 
 
@@ -118,11 +122,11 @@ def mend_start(
     """(start, interrupted): a spoilt mesh moved to where images want it, its triangles kept; atlas
     and maps are made anew. Neighbours move together, so that lost volume comes back and a patch
     that lies off moves as a whole, where steps of single vertices would crumple it."""
-    small = with_values(options, texture_size=min(TEXTURE, options.texture_size))
+    small = with_values(options, texture_size=min(TEXTURE, options.texture.size))
     survey = require_survey(subject)
     maps = transfer_appearance(survey, spoilt, small).maps
     model, result = _fit_shape(subject, options, spoilt, maps, MENDING, effort)
-    mesh = unwrap(model.host_positions(), spoilt.faces, options.texture_size, single=spoilt.single)
+    mesh = unwrap(model.host_positions(), spoilt.faces, options.texture.size, single=spoilt.single)
     return transfer_appearance(survey, mesh, options), result.interrupted
 
 
@@ -137,11 +141,11 @@ def _fit_shape(
     """A mesh with maps after preconditioned steps, ``pace`` times as large as for a sphere; the
     model is left at its best state."""
     reference, sampler = subject.reference, subject.sampler
-    model = Model(mesh, maps, frozenset(options.fit), RATES)
+    model = Model(mesh, maps, frozenset(options.fit.parts), RATES)
     strength, rate = smoothing(len(mesh.faces))
     model.precondition(strength, pace * rate)
     pool = ReferencePool(
-        reference, sampler, POOL, VIEWS, RESOLUTION, POOL_SAMPLES, POINT_WIDTH, options.reuse
+        reference, sampler, POOL, VIEWS, RESOLUTION, POOL_SAMPLES, POINT_WIDTH, options.views.reuse
     )
     validation = Validation(
         reference, sampler.held_out(VALIDATION).draw(0, VALIDATION_VIEWS), RESOLUTION
@@ -149,12 +153,12 @@ def _fit_shape(
     fit_options = FitOptions(
         steps=effort.steps,
         seconds=effort.seconds,
-        loss=options.loss,
+        loss=options.fit.loss,
         laplacian=0.0,
         relative=False,
         decay=1.0,
-        background=options.background_color(),
-        seed=options.seed,
+        background=options.views.background_color(),
+        seed=options.views.seed,
     )
     effort.interrupts.protect()
     result = fit(

@@ -62,7 +62,7 @@ def flatten_maps(
     judge = (
         None
         if model.codec is None
-        else Pictures(model, reference, sampler, min(options.resolution, 256))
+        else Pictures(model, reference, sampler, min(options.views.resolution, 256))
     )
     return replace_constant(maps, start.known, judge, start.maps)
 

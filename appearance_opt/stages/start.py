@@ -102,10 +102,10 @@ class Start:
 def budget(options: SimplifyOptions, available: int) -> int:
     """Triangles asked for. Raises InputError when the input has fewer, or when their tessellation
     does not fit into memory."""
-    count = options.triangles
+    count = options.start.triangles
     if count is None:
-        assert options.ratio is not None
-        count = min(max(4, round(options.ratio * available)), available)
+        assert options.start.ratio is not None
+        count = min(max(4, round(options.start.ratio * available)), available)
     if count > available:
         raise InputError(
             f"--triangles {count}: the input has only {available} triangles; ask for fewer"
@@ -123,8 +123,8 @@ def make_start(
 ) -> Start:
     """Sphere, or decimated reference. ``seconds``: what is left for start and fit (None: no limit).
     ``tell``: called with what begins, in a few words."""
-    size, sampler = options.texture_size, subject.sampler
-    if options.init == "sphere":
+    size, sampler = options.texture.size, subject.sampler
+    if options.start.init == "sphere":
         if triangles < SMALLEST_SPHERE:
             raise InputError(
                 f"--init sphere needs at least {SMALLEST_SPHERE} triangles, not {triangles}"
@@ -132,10 +132,14 @@ def make_start(
         mesh = sphere(triangles, sampler.centre, 0.6 * sampler.radius, size)
         maps = select_told(
             subject.unlit,
-            random_maps(size, options.seed, options.normal_map and "normal" in options.fit),
+            random_maps(
+                size,
+                options.views.seed,
+                options.texture.normal_map and "normal" in options.fit.parts,
+            ),
         )
         known = np.zeros((size, size), bool)
-        if options.displaced:
+        if options.displacement.fitted:
             return Start(
                 mesh,
                 {**maps, DISPLACEMENT: flat_map(mesh, options)},
@@ -150,9 +154,11 @@ def make_start(
     taken = time.perf_counter() - began
     if starts.coarse:
         left_out = "decimation began with a coarse round, and triangles were not moved to where they are missed"
-        many = f"{starts.given:,} triangles are many for --budget {options.budget:g}"
+        many = f"{starts.given:,} triangles are many for --budget {options.fit.budget:g}"
         return replace(start, notes=(f"{many}: {left_out}",))
-    rounds = affordable(options.reallocate, taken, None if seconds is None else seconds - taken)
+    rounds = affordable(
+        options.start.reallocate, taken, None if seconds is None else seconds - taken
+    )
     if not rounds:
         return start
     judge = StartError(subject.reference, starts.survey.triangles, starts.views)
@@ -204,7 +210,7 @@ class _Decimated:
         self.positions, self.faces, self.single = heavy.positions, heavy.faces, heavy.single
         scene, self.given = heavy.scene, len(heavy.faces)
         clusters = max(CLUSTERS * triangles, LEAST_CLUSTERS)
-        self.coarse = is_coarse(self.given, len(heavy.positions), clusters, options.budget)
+        self.coarse = is_coarse(self.given, len(heavy.positions), clusters, options.fit.budget)
         if self.coarse:
             tell("clustering vertices")
             self.positions, self.faces, source = cluster(self.positions, self.faces, clusters)
@@ -214,7 +220,7 @@ class _Decimated:
             )
         count = len(self.faces)
         self.weight, self.visible = np.ones(count), np.ones(count, bool)
-        if not options.keep_hidden:
+        if not options.start.keep_hidden:
             tell("looking for what can be seen")
             pixels = pixel_counts(scene, count, sampler.held_out(VISIBILITY), VISIBILITY_VIEWS)
             self.weight, seen = importance(self.positions, self.faces, pixels)
@@ -264,7 +270,7 @@ class _Decimated:
         scale = np.ones(len(start.mesh.faces))
         # displaced vertices read the rim of a chart on both of its sides, which asks for the same
         # texels everywhere
-        if not self.options.displaced:
+        if not self.options.displacement.fitted:
             scale = chart_scales(start.mesh, start.maps, self.views)
         return self._pack_and_bake(start.charts, scale, tight)
 
@@ -272,7 +278,7 @@ class _Decimated:
         options = self.options
         self.tell("packing the atlas and baking its maps")
         mesh = pack_charts(
-            charts, scale, options.texture_size, gutter(len(charts.faces), options), tight
+            charts, scale, options.texture.size, gutter(len(charts.faces), options), tight
         )
         return replace(transfer_appearance(self.survey, mesh, options), charts=charts)
 
@@ -296,10 +302,13 @@ def transfer_appearance(survey: Survey, mesh: LatentMesh, options: SimplifyOptio
     """A mesh with the reference's appearance in its maps."""
     finest = None
     displacement: dict[str, NDArray] = {}
-    if options.displaced:
+    if options.displacement.fitted:
         finest, displacement = bake_displacement(survey, mesh, options, REACH * median_edge(mesh))
     result = transfer(
-        survey, mesh if finest is None else finest, options.texture_size, not options.keep_hidden
+        survey,
+        mesh if finest is None else finest,
+        options.texture.size,
+        not options.start.keep_hidden,
     )
     missed = result.missed.sum() / max(int(result.covered.sum()), 1)
     if missed > 0.01:
@@ -308,7 +317,9 @@ def transfer_appearance(survey: Survey, mesh: LatentMesh, options: SimplifyOptio
             100 * missed,
         )
     maps = {
-        n: v for n, v in result.maps.items() if options.normal_map or not n.startswith("normal")
+        n: v
+        for n, v in result.maps.items()
+        if options.texture.normal_map or not n.startswith("normal")
     }
     return Start(
         mesh,
@@ -341,7 +352,7 @@ def atlas_of(
     options: SimplifyOptions,
     sides: NDArray[np.bool_],
 ) -> tuple[LatentMesh, list[str]]:
-    """(the mesh that ``options.init`` names, moved to a ``placement``, with a new atlas; notes).
+    """(the mesh that ``options.start.init`` names, moved to a ``placement``, with a new atlas; notes).
     ``available``: triangles of the reference; ``sides``: those that are seen from their front only.
     If either all or none are, so it is with the mesh; else its file decides. Transparent parts are
     left out, for those of the input pass into the result. Raises InputError when it has more
@@ -349,14 +360,16 @@ def atlas_of(
     from appearance_opt.asset.normals import weld
     from appearance_opt.asset.sides import single_sided
 
-    parts = split(given, f"--init {options.init}", "start from", by_light=False)
+    parts = split(given, f"--init {options.start.init}", "start from", by_light=False)
     asset = parts.fitted
     most = (
-        None if options.triangles is None and options.ratio is None else budget(options, available)
+        None
+        if options.start.triangles is None and options.start.ratio is None
+        else budget(options, available)
     )
     if most is not None and asset.triangle_count > most:
         raise InputError(
-            f"--init {options.init}: has {asset.triangle_count} triangles, more than the {most} asked for"
+            f"--init {options.start.init}: has {asset.triangle_count} triangles, more than the {most} asked for"
         )
     offsets = np.cumsum([0] + [len(m.positions) for m in asset.meshes[:-1]])
     p = np.concatenate([m.positions for m in asset.meshes]).astype(np.float64)
@@ -370,7 +383,7 @@ def atlas_of(
     mesh = unwrap(
         placement.relative_to(asset.origin).to_local(p[first]),
         faces,
-        options.texture_size,
+        options.texture.size,
         gutter(len(faces), options),
         single,
     )

@@ -10,7 +10,7 @@ BPY is a virtual environment of its own, for Blender's package wants other versi
 Without --blender, its table stays empty. Pairs: each asset decimated to 2 to 5 % of its triangles
 and unwrapped, geometry alone; both bakers get the same two files. The judge is the renderer in
 ``../shared/judge``, which is not ours. --joint adds a bake whose shape is fitted, too, without any
-triangle more (``bake --joint --subdivision 0``), from the same two files. Each stage that is on
+triangle more (``joint --subdivision 0``), from the same two files. Each stage that is on
 disk in ``out/baking`` is not run again (delete the folder to start over); ``--table`` prints the
 tables for docs/baking.md from what is there. Times are of the bakes alone, ours with warm kernels.
 """
@@ -60,10 +60,10 @@ def ours(source: Path, low: Path, stem: Path, preset: str, steps: int | None) ->
 
 def with_shape(source: Path, low: Path, stem: Path, preset: str, steps: int | None) -> dict:
     """The bake that moves LOW's vertices, too: the same triangles and texture coordinates."""
-    from appearance_opt import bake_options, save
+    from appearance_opt import joint_options, save
     from appearance_opt.jobs.joint import joint
 
-    options = bake_options(preset, joint=True, subdivision=(0,), texture_size=SIZE, steps=steps)
+    options = joint_options(preset, subdivision=(0,), texture_size=SIZE, steps=steps)
     result = joint(source, low, None, options)
     save(result.shown, f"{stem}_joint.glb")
     return {"seconds": result.seconds["total"], "steps": result.fit.steps}

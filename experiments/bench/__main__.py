@@ -106,12 +106,12 @@ def run_case(
 ) -> dict:
     """Median and range in ms of a whole step, the sum of its kernels, kernels compiled, peak
     memory."""
-    from appearance_opt.config import CommonOptions
     from appearance_opt.fit import adam
     from appearance_opt.fit.loop import LOSS_EVERY
     from appearance_opt.fit.losses import LOSSES
     from appearance_opt.fit.step import Gradients, StepInputs, first_non_finite, step
     from appearance_opt.latent.laplacian import Laplacian
+    from appearance_opt.options.views import ViewOptions
     from appearance_opt.reference.pool import ReferencePool, Targets
     from appearance_opt.render.pixels import Batch, Grid
     from appearance_opt.render.quality import Quality
@@ -129,10 +129,8 @@ def run_case(
     )
     views = [sampler.draw(k, 4) for k in range(8)]
     kept = [Targets(source.render_device(Batch(v.records(), grid), 1)) for v in views]
-    pool = ReferencePool(
-        source, sampler, 8, 4, resolution, POOL_SAMPLES, width, CommonOptions.reuse
-    )
-    at_once = CommonOptions.reuse if images == "as in a fit" else 1
+    pool = ReferencePool(source, sampler, 8, 4, resolution, POOL_SAMPLES, width, ViewOptions.reuse)
+    at_once = ViewOptions.reuse if images == "as in a fit" else 1
 
     def one(k: int) -> None:
         v, target = views[k % 8], kept[k % 8]

@@ -4,7 +4,7 @@
     python -m experiments.cleanup --table
 
 Each asset is simplified without a fit, damaged (``damage.py``), and mended in two ways: "init" is
-``simplify --init BAD.glb --absolute``, "joint" is ``bake --joint --subdivision 2``, which keeps
+``simplify --init BAD.glb --absolute``, "joint" is ``joint --subdivision 2``, which keeps
 BAD's texture coordinates and adds a displacement map. "Won back": the share of the difference
 between the damaged mesh and the undamaged start that is undone. Results are kept row by row in
 ``out/cleanup/results.json``, and a picture of each row (reference, start, damaged, cleaned, in two
@@ -55,7 +55,7 @@ def mended(source: Path, bad: Path, way: str, common: dict) -> ao.SimplifyResult
     from appearance_opt.jobs.joint import joint
 
     if way == "joint":
-        return joint(source, bad, None, ao.bake_options(joint=True, subdivision=(LEVEL,), **common))
+        return joint(source, bad, None, ao.joint_options(subdivision=(LEVEL,), **common))
     options = ao.simplify_options(init=str(bad), relative=False, **common)
     return ao.simplify(source, None, options)
 

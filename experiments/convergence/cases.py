@@ -133,7 +133,7 @@ def _from_mesh(
 
     _, rates = fit_policy(validation.psnr(fresh(Rates())), True)
     # a bent start must not be held in its shape
-    fit_options = FitOptions(laplacian=options.laplacian if bend is None else 0.0, seed=seed)
+    fit_options = FitOptions(laplacian=options.fit.laplacian if bend is None else 0.0, seed=seed)
     return Case(name, lambda: fresh(rates), pool, validation, fit_options)
 
 

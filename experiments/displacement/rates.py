@@ -49,8 +49,10 @@ class Bench:
             triangles=TRIANGLES, displacement=True, subdivision=(LEVEL,), reallocate=0
         )
         self.start = make_start(placed.subject, options, TRIANGLES)
-        width = point_width(RESOLUTION, options.texture_size)
-        self.pool = ReferencePool(reference, sampler, POOL, options.views, RESOLUTION, 16, width)
+        width = point_width(RESOLUTION, options.texture.size)
+        self.pool = ReferencePool(
+            reference, sampler, POOL, options.views.per_step, RESOLUTION, 16, width
+        )
         self.validation = Validation(reference, sampler.held_out(VALIDATION).draw(0, 8), HELD_OUT)
 
     def run(self, case: str, steps: int) -> dict:

@@ -47,7 +47,7 @@ a.save(result.start, stem + "_start.glb")
 closed = {}
 for name in ("start", "result"):
     low = a.load(stem + ("_start.glb" if name == "start" else ".glb"))
-    bake = a.bake_options(closed_form=True, texture_size=options.texture_size)
+    bake = a.bake_options(closed_form=True, texture_size=options.texture.size)
     try:
         closed[name] = a.bake(asset, low, stem + "_" + name + "_closed.glb", bake).asset
     except a.InputError as error:  # a baker needs a light mesh that lies near the heavy one

@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
-from appearance_opt.config import CommonOptions, simplify_options
+from appearance_opt.config import simplify_options
 from appearance_opt.fit.loop import FitOptions
 from appearance_opt.fit.model import Rates
+from appearance_opt.options.views import ViewOptions
 from appearance_opt.render.quality import Quality
 from appearance_opt.stages import fitting, growth
 
@@ -27,7 +28,7 @@ class Setup:
     texture: int
     decimated: bool
     pool_samples: int = fitting.POOL_SAMPLES
-    reuse: int = CommonOptions.reuse
+    reuse: int = ViewOptions.reuse
     point_width: float | None = None
     rates: Rates | None = None
     rate_factor: float = 1.0
@@ -64,7 +65,14 @@ def default_setup(grown: bool, triangles: int) -> Setup:
             relative=False, smoothing=strength, smooth_rate=rate,
         )  # fmt: skip
     o = simplify_options("default", ratio=1.0)
-    return Setup(o.resolution, o.views, o.pool, o.texture_size, True, laplacian=o.laplacian)
+    return Setup(
+        o.views.resolution,
+        o.views.per_step,
+        o.views.pool,
+        o.texture.size,
+        True,
+        laplacian=o.fit.laplacian,
+    )
 
 
 @dataclass(frozen=True)
@@ -137,7 +145,7 @@ def _plain_adam(s: Setup) -> Setup | None:
     return replace(s, smoothing=0.0, rates=rates, laplacian=FIRST_LAPLACIAN, relative=False)
 
 
-FIRST_LAPLACIAN = simplify_options("default", ratio=1.0).laplacian
+FIRST_LAPLACIAN = simplify_options("default", ratio=1.0).fit.laplacian
 """Weight where the default has none: that of decimated starts."""
 
 LEVERS = (

@@ -137,7 +137,7 @@ class Bench:
     def _decimated(self, texture: int) -> Start:
         # a number of steps instead of a budget: a slow machine must not drop rounds of reallocation
         options = simplify_options("default", ratio=self.subject.ratio, steps=0)
-        first = options.texture_size
+        first = options.texture.size
 
         def make() -> tuple[Start, bool]:
             if texture == first:

@@ -1,0 +1,47 @@
+"""What a simplification starts from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from appearance_opt.errors import InputError
+from appearance_opt.options.option import Record, check_choice, option
+
+INITS = ("decimate", "sphere")
+
+
+@dataclass(frozen=True)
+class StartOptions(Record):
+    """``triangles`` or ``ratio``: the budget (exactly one; neither is needed where ``init`` is a
+    file)."""
+
+    triangles: int | None = option(
+        None, "At most this many triangles.", panel="Start", low=1, expected="at least 1"
+    )
+    ratio: float | None = option(
+        None, "Fraction of the input's triangles instead.", panel="Start", above=0, high=1
+    )
+    init: str = option(
+        "decimate",
+        "decimate, sphere, or a file to start from.",
+        panel="Start",
+        metavar="decimate|sphere|FILE",
+    )
+    reallocate: int = option(
+        1, "Rounds of moving triangles to the image error.", panel="Start", low=0, high=10
+    )
+    keep_hidden: bool = option(False, "Keep geometry that no outside view sees.", panel="Start")
+
+    def __post_init__(self) -> None:
+        given = (self.triangles is not None) + (self.ratio is not None)
+        if given == 2 or (given == 0 and self.init in INITS):
+            raise InputError("give either --triangles N or --ratio R")
+        super().__post_init__()
+        if self.file is None:
+            check_choice("init", self.init, INITS)
+
+    @property
+    def file(self) -> str | None:
+        """The file to start from, if ``init`` names one."""
+        return self.init if self.init not in INITS and Path(self.init).suffix else None
