@@ -5,9 +5,11 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from appearance_opt.asset import load, save
+    from appearance_opt.asset import Asset, load, save
     from appearance_opt.config import (
         BakeOptions,
+        CompareOptions,
+        InspectOptions,
         JointOptions,
         SimplifyOptions,
         bake_options,
@@ -21,23 +23,48 @@ if TYPE_CHECKING:
         InputError,
         ReferenceRenderError,
     )
-    from appearance_opt.jobs.bake import bake
+    from appearance_opt.evaluate.comparison import Comparison
+    from appearance_opt.jobs.bake import BakeResult, bake
     from appearance_opt.jobs.compare import compare
-    from appearance_opt.jobs.inspect import inspect
+    from appearance_opt.jobs.inspect import Inspection, inspect
     from appearance_opt.jobs.joint import joint
-    from appearance_opt.jobs.simplify import simplify
+    from appearance_opt.jobs.simplify import SimplifyResult, simplify
+    from appearance_opt.jobs.spec import JobSpec, run
+    from appearance_opt.options.baking import BakingOptions
+    from appearance_opt.options.fitting import FittingOptions
+    from appearance_opt.options.maps import DisplacementOptions, TextureOptions
+    from appearance_opt.options.reading import AssetOptions
+    from appearance_opt.options.start import StartOptions
+    from appearance_opt.options.views import ViewOptions
+    from appearance_opt.reference.base import Reference
 
 __version__ = "0.1.0"
 
 _HOMES = {
     "AppearanceError": "appearance_opt.errors",
+    "Asset": "appearance_opt.asset",
+    "AssetOptions": "appearance_opt.options.reading",
     "BackendError": "appearance_opt.errors",
     "BakeOptions": "appearance_opt.config",
+    "BakeResult": "appearance_opt.jobs.bake",
+    "BakingOptions": "appearance_opt.options.baking",
+    "CompareOptions": "appearance_opt.config",
+    "Comparison": "appearance_opt.evaluate.comparison",
+    "DisplacementOptions": "appearance_opt.options.maps",
     "DivergedError": "appearance_opt.errors",
+    "FittingOptions": "appearance_opt.options.fitting",
     "InputError": "appearance_opt.errors",
+    "InspectOptions": "appearance_opt.config",
+    "Inspection": "appearance_opt.jobs.inspect",
+    "JobSpec": "appearance_opt.jobs.spec",
     "JointOptions": "appearance_opt.config",
+    "Reference": "appearance_opt.reference.base",
     "ReferenceRenderError": "appearance_opt.errors",
     "SimplifyOptions": "appearance_opt.config",
+    "SimplifyResult": "appearance_opt.jobs.simplify",
+    "StartOptions": "appearance_opt.options.start",
+    "TextureOptions": "appearance_opt.options.maps",
+    "ViewOptions": "appearance_opt.options.views",
     "bake": "appearance_opt.jobs.bake",
     "bake_options": "appearance_opt.config",
     "compare": "appearance_opt.jobs.compare",
@@ -45,6 +72,7 @@ _HOMES = {
     "joint": "appearance_opt.jobs.joint",
     "joint_options": "appearance_opt.config",
     "load": "appearance_opt.asset",
+    "run": "appearance_opt.jobs.spec",
     "save": "appearance_opt.asset",
     "simplify": "appearance_opt.jobs.simplify",
     "simplify_options": "appearance_opt.config",
@@ -52,13 +80,29 @@ _HOMES = {
 
 __all__ = [
     "AppearanceError",
+    "Asset",
+    "AssetOptions",
     "BackendError",
     "BakeOptions",
+    "BakeResult",
+    "BakingOptions",
+    "CompareOptions",
+    "Comparison",
+    "DisplacementOptions",
     "DivergedError",
+    "FittingOptions",
     "InputError",
+    "InspectOptions",
+    "Inspection",
+    "JobSpec",
     "JointOptions",
+    "Reference",
     "ReferenceRenderError",
     "SimplifyOptions",
+    "SimplifyResult",
+    "StartOptions",
+    "TextureOptions",
+    "ViewOptions",
     "bake",
     "bake_options",
     "compare",
@@ -66,6 +110,7 @@ __all__ = [
     "joint",
     "joint_options",
     "load",
+    "run",
     "save",
     "simplify",
     "simplify_options",

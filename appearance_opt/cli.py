@@ -7,18 +7,21 @@ import logging
 import signal
 import sys
 import time
-from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from appearance_opt import __version__
 from appearance_opt.config import as_dict
-from appearance_opt.errors import AppearanceError
+from appearance_opt.errors import AppearanceError, InputError
 from appearance_opt.jobs.spec import JobSpec, run
-from appearance_opt.parameters import Given, job_command
+from appearance_opt.parameters import Command, Given, job_command
+
+if TYPE_CHECKING:
+    from appearance_opt.evaluate.comparison import Comparison
+    from appearance_opt.jobs.inspect import Inspection
 
 BEGAN = time.perf_counter()
 """Time budgets count from here: importing is part of a run."""
@@ -127,7 +130,7 @@ def simplify(
     """Write an asset with fewer triangles that looks like INPUT."""
     spec = given.spec(out, config, frozenset({"triangles", "ratio"}))
     folder = None if no_report else report or _report_of(out)
-    _run_fit(spec, _count, folder, checkpoint=checkpoint, resume=resume, inputs=_files(config))
+    _run_fit(spec, folder, checkpoint=checkpoint, resume=resume, inputs=_files(config))
 
 
 @job_command(app, "bake")
@@ -145,12 +148,7 @@ def bake(
     """Bake what HIGH looks like into the maps of LOW, which keeps its shape."""
     folder = None if no_report else report or _report_of(out)
     spec = given.spec(out, config)
-
-    def say(result: Any) -> str:
-        maps = ",".join(as_dict(spec.options)["maps"])
-        return f"{maps}, {100 * result.missed_share:.2f} % of the texels missed"
-
-    _run_fit(spec, say, folder, textures=textures, inputs=_files(config))
+    _run_fit(spec, folder, textures=textures, inputs=_files(config))
 
 
 @job_command(app, "joint")
@@ -163,7 +161,7 @@ def joint(
 ) -> None:
     """Bake with LOW's shape free: fit it, a displacement, normals and material together."""
     folder = None if no_report else report or _report_of(out)
-    _run_fit(given.spec(out, config), _count, folder, inputs=_files(config))
+    _run_fit(given.spec(out, config), folder, inputs=_files(config))
 
 
 @job_command(app, "compare")
@@ -176,29 +174,33 @@ def compare(
     as_json: Json = False,
 ) -> None:
     """Measure how different two assets look: PSNR, FLIP, silhouettes."""
-    result = run(given.spec(out))
-    for note in result.notes:
-        print(f"note: {note}", file=sys.stderr)
-    metrics = result.metrics
-    if as_json:
-        _print_json(asdict(metrics))
-        return
-    print(f"PSNR, covered pixels  {metrics.psnr_covered:7.2f} dB")
-    print(f"PSNR, whole image     {metrics.psnr:7.2f} dB")
-    print(f"FLIP                  {metrics.flip:7.4f}")
-    print(f"silhouette IoU        {metrics.silhouette_iou:7.4f}")
-    print(f"silhouette shift      {metrics.silhouette_shift:7.3f} px")
+    _show_comparison(run(given.spec(out)), as_json)
 
 
 @job_command(app, "inspect")
 def inspect(given: Given, as_json: Json = False) -> None:
     """Say what is in an asset, what is wrong with it, and what simplify will do with each
     material."""
-    found = run(given.spec())
-    if as_json:
-        _print_json(found.record())
-        return
-    print("\n".join(found.lines()))
+    _show_inspection(run(given.spec()), as_json)
+
+
+@app.command("run", cls=Command)
+def run_file(
+    job: Annotated[Path, typer.Argument(metavar="JOB", help="A TOML or JSON file.")],
+    report: Report = None,
+    no_report: NoReport = False,
+    as_json: Json = False,
+) -> None:
+    """Run the job that a file holds: job, inputs and out beside the options of that job."""
+    spec = JobSpec.read(job)
+    if spec.kind == "inspect":
+        _show_inspection(run(spec), as_json)
+    elif spec.kind == "compare":
+        _show_comparison(run(spec), as_json)
+    elif spec.out is None:
+        raise InputError(f"{job}: out: must be the name of a file")
+    else:
+        _run_fit(spec, None if no_report else report or _report_of(Path(spec.out)), inputs=[job])
 
 
 @app.command()
@@ -216,31 +218,48 @@ def doctor(as_json: Annotated[bool, typer.Option("--json", help="Print as JSON."
         raise AppearanceError(str(found["problem"]))
 
 
-def _run_fit(
-    spec: JobSpec, say: Callable[[Any], str], report: Path | None, **surroundings: Any
-) -> None:
-    """Run a job that may fit, and ``say`` what it did."""
+def _run_fit(spec: JobSpec, report: Path | None, **surroundings: Any) -> None:
+    """Run a job that may fit, and say what it did."""
     from appearance_opt.progress import TerminalProgress
 
     with TerminalProgress() as progress:
         result = run(spec, report=report, progress=progress, began=BEGAN, **surroundings)
     for note in result.notes:
         print(f"note: {note}", file=sys.stderr)
-    curve = [] if result.fit is None else result.fit.curve
-    quality = (
-        f", held-out PSNR {curve[0].psnr:.2f} -> {max(p.psnr for p in curve):.2f} dB"
-        if curve
-        else ""
-    )
-    print(f"{spec.out}: {say(result)}, {result.seconds['total']:.1f} s{quality}")
+    if spec.kind == "bake":
+        maps = ",".join(as_dict(spec.options)["maps"])
+        done = f"{maps}, {100 * result.missed_share:.2f} % of the texels missed"
+    else:
+        kept = f" and {result.kept_triangles} kept as they are" if result.kept_triangles else ""
+        done = f"{result.triangles} of {result.source_triangles} triangles{kept}"
+    done += f", {result.seconds['total']:.1f} s"
+    if result.fit is not None and result.fit.curve:
+        curve = [point.psnr for point in result.fit.curve]
+        done += f", held-out PSNR {curve[0]:.2f} -> {max(curve):.2f} dB"
+    print(f"{spec.out}: {done}")
     if report is not None and (report / "report.html").is_file():
         print(f"report: {report / 'report.html'}")
 
 
-def _count(result: Any) -> str:
-    """Triangles before and after."""
-    kept = f" and {result.kept_triangles} kept as they are" if result.kept_triangles else ""
-    return f"{result.triangles} of {result.source_triangles} triangles{kept}"
+def _show_comparison(result: Comparison, as_json: bool) -> None:
+    for note in result.notes:
+        print(f"note: {note}", file=sys.stderr)
+    metrics = result.metrics
+    if as_json:
+        _print_json(asdict(metrics))
+        return
+    print(f"PSNR, covered pixels  {metrics.psnr_covered:7.2f} dB")
+    print(f"PSNR, whole image     {metrics.psnr:7.2f} dB")
+    print(f"FLIP                  {metrics.flip:7.4f}")
+    print(f"silhouette IoU        {metrics.silhouette_iou:7.4f}")
+    print(f"silhouette shift      {metrics.silhouette_shift:7.3f} px")
+
+
+def _show_inspection(found: Inspection, as_json: bool) -> None:
+    if as_json:
+        _print_json(found.record())
+    else:
+        print("\n".join(found.lines()))
 
 
 def _report_of(out: Path) -> Path:

@@ -97,3 +97,11 @@ def test_every_option_of_a_bake_is_documented() -> None:
     text = (ROOT / "docs" / "baking.md").read_text(encoding="utf-8")
     assert not [n for n in BAKE_OPTION_NAMES if not names(text, n)]
     assert not [n for n in MAPS if f"`{n}`" not in text]
+
+
+def test_every_option_of_a_joint_bake_is_documented() -> None:
+    from appearance_opt.config import JointOptions
+    from appearance_opt.options.option import entries
+
+    text = (ROOT / "docs" / "baking.md").read_text(encoding="utf-8")
+    assert not [n for n in entries(JointOptions) if not names(text, n)]
