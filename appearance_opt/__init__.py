@@ -24,11 +24,12 @@ if TYPE_CHECKING:
         ReferenceRenderError,
     )
     from appearance_opt.evaluate.comparison import Comparison
-    from appearance_opt.jobs.bake import BakeResult, bake
+    from appearance_opt.jobs.bake import bake
     from appearance_opt.jobs.compare import compare
     from appearance_opt.jobs.inspect import Inspection, inspect
     from appearance_opt.jobs.joint import joint
-    from appearance_opt.jobs.simplify import SimplifyResult, simplify
+    from appearance_opt.jobs.result import BakeResult, Result, SimplifyResult
+    from appearance_opt.jobs.simplify import simplify
     from appearance_opt.jobs.spec import JobSpec, run
     from appearance_opt.options.baking import BakingOptions
     from appearance_opt.options.fitting import FittingOptions
@@ -46,7 +47,7 @@ _HOMES = {
     "AssetOptions": "appearance_opt.options.reading",
     "BackendError": "appearance_opt.errors",
     "BakeOptions": "appearance_opt.config",
-    "BakeResult": "appearance_opt.jobs.bake",
+    "BakeResult": "appearance_opt.jobs.result",
     "BakingOptions": "appearance_opt.options.baking",
     "CompareOptions": "appearance_opt.config",
     "Comparison": "appearance_opt.evaluate.comparison",
@@ -60,8 +61,9 @@ _HOMES = {
     "JointOptions": "appearance_opt.config",
     "Reference": "appearance_opt.reference.base",
     "ReferenceRenderError": "appearance_opt.errors",
+    "Result": "appearance_opt.jobs.result",
     "SimplifyOptions": "appearance_opt.config",
-    "SimplifyResult": "appearance_opt.jobs.simplify",
+    "SimplifyResult": "appearance_opt.jobs.result",
     "StartOptions": "appearance_opt.options.start",
     "TextureOptions": "appearance_opt.options.maps",
     "ViewOptions": "appearance_opt.options.views",
@@ -98,6 +100,7 @@ __all__ = [
     "JointOptions",
     "Reference",
     "ReferenceRenderError",
+    "Result",
     "SimplifyOptions",
     "SimplifyResult",
     "StartOptions",
