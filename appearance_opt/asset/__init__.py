@@ -6,11 +6,12 @@ from dataclasses import replace
 from pathlib import Path
 
 from appearance_opt.asset.companions import CHOICES, Companions, MissingTextures
+from appearance_opt.asset.file_options import PLAIN, FileOptions
 from appearance_opt.asset.types import Asset, Displacement, Material, Mesh, Texture
 from appearance_opt.errors import InputError
 from appearance_opt.publish import publishing
 
-__all__ = ["Asset", "Displacement", "Material", "Mesh", "Texture", "load", "save"]
+__all__ = ["Asset", "Displacement", "FileOptions", "Material", "Mesh", "Texture", "load", "save"]
 
 READABLE = (".glb", ".gltf", ".usd", ".usda", ".usdc", ".usdz", ".obj", ".ply", ".stl")
 MAX_REFINE = 5
@@ -117,32 +118,33 @@ def _name_of_variant(variants: dict[str, str] | None, path: Path) -> str | None:
     return names[0] if names else None
 
 
-def save(asset: Asset, path: str | Path) -> None:
-    """Write an asset; the suffix chooses the format. The files of a format that has several appear
-    together or not at all. Raises InputError for a format that cannot be written, OSError when the
-    disk refuses."""
+def save(asset: Asset, path: str | Path, options: FileOptions = PLAIN) -> None:
+    """Write an asset; the suffix chooses the format, ``options`` codecs and compression. The files
+    of a format that has several appear together or not at all. Raises InputError for what cannot be
+    written, OSError when the disk refuses."""
     path = Path(path)
     check_writable(path)
+    options.check(path)
     with publishing(path) as place:
-        write(asset, place)
+        write(asset, place, options)
 
 
-def write(asset: Asset, path: Path) -> None:
+def write(asset: Asset, path: Path, options: FileOptions = PLAIN) -> None:
     """Write an asset's files where they are to be, one after the other: for places of a
     publication. Raises OSError."""
     suffix = path.suffix.lower()
     if suffix in (".glb", ".gltf"):
         from appearance_opt.asset.gltf_write import save_gltf
 
-        save_gltf(asset, path)
+        save_gltf(asset, path, options)
     elif suffix == ".obj":
         from appearance_opt.asset.obj_write import save_obj
 
-        save_obj(asset, path)
+        save_obj(asset, path, options)
     else:
         from appearance_opt.asset.usd_write import save_usd
 
-        save_usd(asset, path)
+        save_usd(asset, path, options)
 
 
 def check_writable(path: Path) -> None:

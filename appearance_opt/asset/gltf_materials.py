@@ -26,7 +26,8 @@ VARIANTS = "KHR_materials_variants"
 UNLIT = "KHR_materials_unlit"
 TRANSMISSION, VOLUME, IOR = (f"KHR_materials_{name}" for name in ("transmission", "volume", "ior"))
 _TRANSPARENT = (TRANSMISSION, VOLUME, IOR)
-_IMAGES = ("EXT_texture_webp", "KHR_texture_basisu")
+WEBP, BASISU = "EXT_texture_webp", "KHR_texture_basisu"
+_IMAGES = (WEBP, BASISU)
 READ_EXTENSIONS = (
     STRENGTH,
     SPECULAR,

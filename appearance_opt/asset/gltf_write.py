@@ -1,104 +1,109 @@
-"""An Asset to glTF 2.0: one GLB file, or .gltf with .bin and PNG files beside it."""
+"""An Asset to glTF 2.0: one GLB file, or .gltf with .bin and image files beside it."""
 
 from __future__ import annotations
 
 import json
 import struct
-from concurrent.futures import ThreadPoolExecutor
+from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
 import numpy as np
 
-from appearance_opt.asset import images
-from appearance_opt.asset.encoding import encoded_for
-from appearance_opt.asset.gltf_materials import IOR, STRENGTH, TRANSMISSION, UNLIT, VOLUME
+from appearance_opt.asset import hierarchy
+from appearance_opt.asset.file_options import PLAIN
+from appearance_opt.asset.gltf_buffers import Buffers
+from appearance_opt.asset.gltf_materials import (
+    BASISU,
+    IOR,
+    STRENGTH,
+    TRANSMISSION,
+    UNLIT,
+    VOLUME,
+    WEBP,
+)
 from appearance_opt.asset.height import as_16_bit, height_png
+from appearance_opt.asset.hierarchy import Transform
+from appearance_opt.asset.quantize import Grid
 from appearance_opt.asset.sides import apart_from_sides
+from appearance_opt.asset.texture_files import Slot, encode_all
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
+    from appearance_opt.asset.file_options import FileOptions, MapKind
     from appearance_opt.asset.types import Asset, ColorSpace, Displacement, Material, Mesh, Texture
 
 _WRAPS = {"repeat": 10497, "clamp": 33071, "mirror": 33648}
-_ARRAY_BUFFER, _ELEMENT_BUFFER = 34962, 34963
+_SOURCES = {"webp": WEBP, "ktx2": BASISU}
+"""Extensions through which a texture names an image that is neither PNG nor JPEG."""
 
 
-def save_gltf(asset: Asset, path: Path) -> None:
-    """Write .glb (one file) or .gltf (geometry in ``<stem>.bin``, textures in ``<stem>_<k>.png``).
+def save_gltf(asset: Asset, path: Path, options: FileOptions = PLAIN) -> None:
+    """Write .glb (one file) or .gltf (geometry in ``<stem>.bin``, textures in ``<stem>_<k>.png``,
+    or the suffix of their codec).
 
     glTF has no displacement: a height map goes to ``<stem>_displacement.png`` (16 bit), and the
     extras of its materials name it, its scale and its mid-level.
     """
     path = Path(path)
-    writer = _Writer(asset, path.stem)
+    writer = _Writer(asset, path.stem, options)
     for name, data in writer.companions.items():
         path.with_name(name).write_bytes(data)
     if path.suffix.lower() == ".glb":
         writer.embed_images()
         path.write_bytes(writer.glb())
         return
-    for k, data in enumerate(writer.image_files):
-        path.with_name(f"{path.stem}_{k}.png").write_bytes(data)
-        writer.json["images"][k] = {"uri": quote(f"{path.stem}_{k}.png")}
-    path.with_suffix(".bin").write_bytes(bytes(writer.binary))
-    writer.json["buffers"] = [{"uri": quote(f"{path.stem}.bin"), "byteLength": len(writer.binary)}]
-    path.write_text(json.dumps(writer.json, indent=1))
+    for k, file in enumerate(writer.images):
+        name = f"{path.stem}_{k}{file.suffix}"
+        path.with_name(name).write_bytes(file.data)
+        writer.json["images"][k] = {"uri": quote(name)}
+        if file.codec in _SOURCES:
+            writer.json["images"][k]["mimeType"] = file.mime
+    path.with_suffix(".bin").write_bytes(bytes(writer.buffers.binary))
+    path.write_text(json.dumps(writer.finished(quote(f"{path.stem}.bin")), indent=1))
 
 
 class _Writer:
     """Collects the JSON and the binary buffer of a file."""
 
-    def __init__(self, asset: Asset, stem: str) -> None:
-        self.binary = bytearray()
-        self.stem = stem
+    def __init__(self, asset: Asset, stem: str, options: FileOptions) -> None:
+        self.buffers = Buffers(options)
+        self.stem, self.options = stem, options
         self.companions: dict[str, bytes] = {}
         self._displacements: dict[int, str] = {}
-        self.json: dict[str, Any] = {
-            "asset": {"version": "2.0", "generator": "appearance-opt"},
-            "scene": 0,
-            **_placed(asset),
-            "meshes": [],
-            "accessors": [],
-            "bufferViews": [],
-        }
         self._textures: dict[tuple[int, str], int] = {}
         self._samplers: list[dict[str, int]] = []
-        self._pending: list[tuple[Texture, ColorSpace]] = []
-        materials: dict[int, int] = {}
-        looks: set[tuple] = set()
-        for mesh in asset.meshes:
-            if id(mesh.material) not in materials:
-                materials[id(mesh.material)] = len(materials)
-                written = self._material(mesh.material)
-                if (look := apart_from_sides(mesh.material)) in looks:
-                    written["name"] += (
-                        "_double_sided" if mesh.material.double_sided else "_single_sided"
-                    )
-                looks.add(look)
-                self.json.setdefault("materials", []).append(written)
-            self.json["meshes"].append(self._mesh(mesh, materials[id(mesh.material)]))
-        with ThreadPoolExecutor() as pool:
-            self.image_files = list(
-                pool.map(lambda p: images.encode_png(encoded_for(*p)), self._pending)
-            )
-        if self._pending:
-            self.json["images"] = [{} for _ in self._pending]
-            self.json["samplers"] = self._samplers
+        self._slots: list[Slot] = []
+        self._materials: dict[int, int] = {}
+        self._looks: set[tuple] = set()
+        self.json: dict[str, Any] = {"asset": _about(asset), "scene": 0, "meshes": []}
+        self._place(asset)
+        self.images = encode_all(self._slots, options)
+        self._name_images()
 
     def embed_images(self) -> None:
         """Put the images into the binary buffer."""
-        for k, data in enumerate(self.image_files):
-            self.json["images"][k] = {"bufferView": self._view(data), "mimeType": "image/png"}
+        for k, file in enumerate(self.images):
+            view = self.buffers.add_bytes(file.data)
+            self.json["images"][k] = {"bufferView": view, "mimeType": file.mime}
+
+    def finished(self, uri: str | None = None) -> dict[str, Any]:
+        """The JSON of the file whose binary buffer is at ``uri`` (None: in the same file)."""
+        self.json["accessors"], self.json["bufferViews"] = (
+            self.buffers.accessors,
+            self.buffers.views,
+        )
+        self.json["buffers"] = self.buffers.extents(uri)
+        for name in self.buffers.required:
+            self._use(name, required=True)
+        return self.json
 
     def glb(self) -> bytes:
         """The whole file."""
-        self.json["buffers"] = [{"byteLength": len(self.binary)}]
-        text = json.dumps(self.json, separators=(",", ":")).encode()
+        self.buffers.binary += b"\0" * (-len(self.buffers.binary) % 4)
+        text = json.dumps(self.finished(), separators=(",", ":")).encode()
         text += b" " * (-len(text) % 4)
-        binary = bytes(self.binary) + b"\0" * (-len(self.binary) % 4)
+        binary = bytes(self.buffers.binary)
         head = struct.pack("<4sII", b"glTF", 2, 12 + 8 + len(text) + 8 + len(binary))
         return b"".join(
             [
@@ -110,60 +115,80 @@ class _Writer:
             ]
         )
 
-    def _view(self, data: bytes, target: int | None = None) -> int:
-        self.binary += b"\0" * (-len(self.binary) % 4)
-        view = {"buffer": 0, "byteOffset": len(self.binary), "byteLength": len(data)}
-        if target is not None:
-            view["target"] = target
-        self.binary += data
-        self.json["bufferViews"].append(view)
-        return len(self.json["bufferViews"]) - 1
-
-    def _attribute(self, values: NDArray, bounds: bool = False) -> int:
-        values = np.ascontiguousarray(values, np.float32)
-        accessor = {
-            "bufferView": self._view(values.tobytes(), _ARRAY_BUFFER),
-            "componentType": 5126,
-            "count": len(values),
-            "type": f"VEC{values.shape[1]}",
-        }
-        if bounds:
-            accessor["min"], accessor["max"] = (
-                values.min(axis=0).tolist(),
-                values.max(axis=0).tolist(),
+    def _place(self, asset: Asset) -> None:
+        """Scene, nodes and meshes. Meshes of one node are one mesh in its coordinates. Those of no
+        node have one each, below a root that brings them to the asset's origin if that is not the
+        world's."""
+        transforms, world = hierarchy.place_nodes(asset.nodes)
+        self.json["nodes"] = nodes = [
+            _node(n.name, t, n.extras) for n, t in zip(asset.nodes, transforms, strict=True)
+        ]
+        tops: list[int] = []
+        for k, node in enumerate(asset.nodes):
+            siblings = (
+                tops if node.parent is None else nodes[node.parent].setdefault("children", [])
             )
-        self.json["accessors"].append(accessor)
-        return len(self.json["accessors"]) - 1
+            siblings.append(k)
+        groups = hierarchy.group_by_node(asset)
+        loose = [asset.meshes[k] for k in groups.pop(None, [])]
+        for number, members in groups.items():
+            assert number is not None
+            meshes = [
+                hierarchy.in_coordinates(asset.meshes[k], world[number], asset.origin)
+                for k in members
+            ]
+            self._hang(meshes, nodes[number], nodes)
+        self.json["scenes"] = [{"nodes": tops}]
+        if loose and any(asset.origin):
+            nodes.append({"name": asset.name, "translation": list(asset.origin), "children": []})
+            tops.append(len(nodes) - 1)
+            tops = nodes[-1]["children"]
+        grid = self._grid(loose)
+        for mesh in loose:
+            tops.append(len(nodes))
+            nodes.append({"name": mesh.name, **self._shown([mesh], mesh.name, grid)})
 
-    def _mesh(self, mesh: Mesh, material: int) -> dict[str, Any]:
-        attributes = {"POSITION": self._attribute(mesh.positions, bounds=True)}
-        if mesh.normals is not None:
-            attributes["NORMAL"] = self._attribute(_unit(mesh.normals))
-            if mesh.tangents is not None:
-                tangents = np.concatenate(
-                    [_unit(mesh.tangents[:, :3]), mesh.tangents[:, 3:]], axis=1
-                )
-                attributes["TANGENT"] = self._attribute(tangents)
-        if mesh.uvs is not None:
-            attributes["TEXCOORD_0"] = self._attribute(mesh.uvs)
-        if mesh.colors is not None:
-            attributes["COLOR_0"] = self._attribute(mesh.colors)
-        # the largest index of a type is reserved (primitive restart)
-        kind, code = (np.uint16, 5123) if len(mesh.positions) < 65535 else (np.uint32, 5125)
-        view = self._view(np.ascontiguousarray(mesh.faces, kind).tobytes(), _ELEMENT_BUFFER)
-        indices = {
-            "bufferView": view,
-            "componentType": code,
-            "count": 3 * len(mesh.faces),
-            "type": "SCALAR",
-        }
-        self.json["accessors"].append(indices)
-        primitive = {
-            "attributes": attributes,
-            "indices": len(self.json["accessors"]) - 1,
-            "material": material,
-        }
-        return {"name": mesh.name, "primitives": [primitive]}
+    def _hang(self, meshes: list[Mesh], node: dict[str, Any], nodes: list[dict[str, Any]]) -> None:
+        """Let a node show meshes in its coordinates. What undoes a grid gets a node of its own
+        below it, so that the pivot stays."""
+        name = node.get("name", "mesh")
+        shown = self._shown(meshes, name, self._grid(meshes))
+        if len(shown) == 1:
+            node |= shown
+            return
+        node.setdefault("children", []).append(len(nodes))
+        nodes.append({"name": f"{name}_mesh", **shown})
+
+    def _grid(self, meshes: list[Mesh]) -> Grid | None:
+        """The grid of meshes whose positions are to be quantised. Not of those whose thickness the
+        scale of a node would change (KHR_materials_volume)."""
+        thick = any(m.material.volume and m.material.volume.thickness > 0 for m in meshes)
+        if not self.options.quantize or not meshes or thick:
+            return None
+        return Grid.around([m.positions for m in meshes])
+
+    def _shown(self, meshes: list[Mesh], name: str, grid: Grid | None) -> dict[str, Any]:
+        """What a node says that shows meshes: as one of the file, and what undoes their grid."""
+        primitives = []
+        for mesh in meshes:
+            primitive = self.buffers.primitive(mesh, grid)
+            primitives.append({**primitive, "material": self._number(mesh.material)})
+        self.json["meshes"].append({"name": name, "primitives": primitives})
+        out: dict[str, Any] = {"mesh": len(self.json["meshes"]) - 1}
+        if grid is not None:
+            out |= {"translation": list(grid.low), "scale": [grid.scale] * 3}
+        return out
+
+    def _number(self, material: Material) -> int:
+        """Index of a material, written when it is first asked for."""
+        if id(material) not in self._materials:
+            self._materials[id(material)] = len(self._materials)
+            written = self._material(material)
+            if (look := apart_from_sides(material)) in self._looks:
+                written["name"] += "_double_sided" if material.double_sided else "_single_sided"
+            self._looks.add(look)
+            self.json.setdefault("materials", []).append(written)
+        return self._materials[id(material)]
 
     def _material(self, m: Material) -> dict[str, Any]:
         pbr: dict[str, Any] = {
@@ -172,13 +197,14 @@ class _Writer:
             "metallicFactor": m.metalness,
         }
         if m.base_color_texture is not None:
-            pbr["baseColorTexture"] = {"index": self._texture(m.base_color_texture, "srgb")}
+            pbr["baseColorTexture"] = {"index": self._texture(m.base_color_texture, "color")}
         if (
             m.unlit
         ):  # what readers without the extension show comes near (KHR_materials_unlit, "Fallback")
             pbr |= {"roughnessFactor": 0.9, "metallicFactor": 0.0}
         elif m.orm_texture is not None:
-            pbr["metallicRoughnessTexture"] = {"index": self._texture(m.orm_texture)}
+            orm = self._texture(m.orm_texture, "material", not m.has_occlusion)
+            pbr["metallicRoughnessTexture"] = {"index": orm}
         out: dict[str, Any] = {
             "name": m.name,
             "pbrMetallicRoughness": pbr,
@@ -188,11 +214,11 @@ class _Writer:
             self._extend(out, UNLIT, {})
         elif m.normal_texture is not None:
             out["normalTexture"] = {
-                "index": self._texture(m.normal_texture),
+                "index": self._texture(m.normal_texture, "normal"),
                 "scale": m.normal_scale,
             }
         if m.orm_texture is not None and m.has_occlusion and not m.unlit:
-            out["occlusionTexture"] = {"index": self._texture(m.orm_texture)}
+            out["occlusionTexture"] = {"index": self._texture(m.orm_texture, "material")}
         if m.emits and not m.unlit:
             self._add_emission(out, m)
         if m.transmission > 0:
@@ -209,14 +235,16 @@ class _Writer:
         strength = max(1.0, *m.emission)  # factors end at 1
         out["emissiveFactor"] = [x / strength for x in m.emission]
         if m.emission_texture is not None:
-            out["emissiveTexture"] = {"index": self._texture(m.emission_texture, "srgb")}
+            out["emissiveTexture"] = {"index": self._texture(m.emission_texture, "color")}
         if strength > 1:
             self._extend(out, STRENGTH, {"emissiveStrength": strength})
 
     def _add_transmission(self, out: dict[str, Any], m: Material) -> None:
         through: dict[str, Any] = {"transmissionFactor": m.transmission}
         if m.transmission_texture is not None:
-            through["transmissionTexture"] = {"index": self._texture(m.transmission_texture)}
+            through["transmissionTexture"] = {
+                "index": self._texture(m.transmission_texture, "material")
+            }
         self._extend(out, TRANSMISSION, through)
         if m.ior != 1.5:
             self._extend(out, IOR, {"ior": m.ior})
@@ -229,15 +257,19 @@ class _Writer:
         if np.isfinite(m.volume.attenuation_distance):
             inside["attenuationDistance"] = m.volume.attenuation_distance
         if m.thickness_texture is not None:
-            inside["thicknessTexture"] = {"index": self._texture(m.thickness_texture)}
+            inside["thicknessTexture"] = {"index": self._texture(m.thickness_texture, "material")}
         self._extend(out, VOLUME, inside)
 
     def _extend(self, out: dict[str, Any], name: str, values: dict[str, Any]) -> None:
         """Add an extension to a material, and to those that the file uses."""
         out.setdefault("extensions", {})[name] = values
-        used = self.json.setdefault("extensionsUsed", [])
-        if name not in used:
-            used.append(name)
+        self._use(name)
+
+    def _use(self, name: str, required: bool = False) -> None:
+        for key in ("extensionsUsed", "extensionsRequired")[: 1 + required]:
+            names = self.json.setdefault(key, [])
+            if name not in names:
+                names.append(name)
 
     def _displacement(self, given: Displacement) -> dict[str, Any]:
         d = as_16_bit(given)
@@ -248,9 +280,11 @@ class _Writer:
         uri = quote(self._displacements[id(given)])
         return {"uri": uri, "scale": d.scale, "midLevel": d.mid, "texCoord": 0, "unit": "metre"}
 
-    def _texture(self, texture: Texture, space: ColorSpace = "linear") -> int:
-        """Index of a texture in a slot of that encoding."""
-        key = (id(texture), space)
+    def _texture(self, texture: Texture, kind: MapKind, free_red: bool = False) -> int:
+        """Index of a texture in a slot for maps of that kind. ``free_red``: see ``Slot``; what is
+        asked for with and without it is one texture, with the red channel that it has."""
+        space: ColorSpace = "srgb" if kind == "color" else "linear"
+        key = (id(texture), kind)
         if key not in self._textures:
             sampler = {
                 "magFilter": 9729,
@@ -260,25 +294,48 @@ class _Writer:
             }
             if sampler not in self._samplers:
                 self._samplers.append(sampler)
-            self._textures[key] = len(self._pending)
-            entry = {"source": len(self._pending), "sampler": self._samplers.index(sampler)}
+            self._textures[key] = len(self._slots)
+            entry = {"sampler": self._samplers.index(sampler), "source": len(self._slots)}
             self.json.setdefault("textures", []).append(entry)
-            self._pending.append((texture, space))
+            self._slots.append(Slot(texture, space, kind, free_red))
+        elif not free_red:
+            self._slots[self._textures[key]] = Slot(texture, space, kind)
         return self._textures[key]
 
+    def _name_images(self) -> None:
+        """Let textures name images of other codecs than glTF's own by the extensions that know
+        them. There is no other image to fall back on, so that a reader must know them, too."""
+        if not self._slots:
+            return
+        self.json["images"] = [{} for _ in self._slots]
+        self.json["samplers"] = self._samplers
+        for entry, file in zip(self.json["textures"], self.images, strict=True):
+            extension = _SOURCES.get(file.codec)
+            if extension is not None:
+                entry["extensions"] = {extension: {"source": entry.pop("source")}}
+                self._use(extension, required=True)
 
-def _placed(asset: Asset) -> dict[str, Any]:
-    """Scene and nodes: one for each mesh, below a root that brings them to the asset's origin if
-    that is not the world's."""
-    nodes: list[dict[str, Any]] = [{"mesh": k, "name": m.name} for k, m in enumerate(asset.meshes)]
-    tops = list(range(len(nodes)))
-    if any(asset.origin):
-        nodes.append({"name": asset.name, "translation": list(asset.origin), "children": tops})
-        tops = [len(nodes) - 1]
-    return {"scenes": [{"nodes": tops}], "nodes": nodes}
+
+def _about(asset: Asset) -> dict[str, Any]:
+    """What the file says of itself."""
+    out: dict[str, Any] = {"version": "2.0", "generator": "appearance-opt"}
+    if asset.credits.copyright:
+        out["copyright"] = asset.credits.copyright
+    if asset.credits.extras is not None:
+        out["extras"] = asset.credits.extras
+    return out
 
 
-def _unit(v: NDArray) -> NDArray[np.float32]:
-    """Unit length to float32 precision, which the validator asks for."""
-    w = np.asarray(v, np.float64)
-    return (w / np.maximum(np.linalg.norm(w, axis=1, keepdims=True), 1e-30)).astype(np.float32)
+def _node(name: str, transform: Transform, extras: Any) -> dict[str, Any]:
+    """A node without meshes or children. What is the default is left out."""
+    out: dict[str, Any] = {"name": name}
+    for key, default in _RESTING.items():
+        value = getattr(transform, key)
+        if value != default:
+            out[key] = list(value)
+    if extras is not None:
+        out["extras"] = extras
+    return out
+
+
+_RESTING = {f.name: f.default for f in fields(Transform)}

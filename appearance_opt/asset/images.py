@@ -25,6 +25,9 @@ if TYPE_CHECKING:
 MAX_SIZE = 16384
 """Widest and highest texture read (pixels)."""
 
+MAX_WEBP = 16383
+"""Widest and highest WebP (the container specification: 14 bits)."""
+
 
 def decode(data: bytes, name: str, budget: Budget | None = None) -> NDArray:
     """Pixels (H, W, C) of an image file in memory; uint8, uint16 or float32 as stored, row 0 on
@@ -158,6 +161,34 @@ def encode_png(pixels: NDArray, attributes: Mapping[str, float | str] | None = N
     return _encode(np.ascontiguousarray(pixels), spec, ".png", attributes)
 
 
+def encode_jpeg(pixels: NDArray, quality: int) -> bytes:
+    """JPEG file of (H, W, 1 or 3) uint8 pixels, colours at full resolution; ``quality``: 1 to
+    100."""
+    import OpenImageIO as oiio
+
+    height, width, channels = pixels.shape
+    spec = oiio.ImageSpec(width, height, channels, oiio.UINT8)
+    spec.attribute("Compression", f"jpeg:{quality}")
+    spec.attribute("jpeg:subsampling", "4:4:4")
+    return _encode(np.ascontiguousarray(pixels), spec, ".jpg")
+
+
+def encode_webp(pixels: NDArray, quality: int | None = None) -> bytes:
+    """WebP file of (H, W, 3 or 4) uint8 pixels; ``quality``: 1 to 100, None: lossless."""
+    import OpenImageIO as oiio
+
+    height, width, channels = pixels.shape
+    if max(height, width) > MAX_WEBP:
+        raise InputError(
+            f"a texture of {width} x {height} pixels is too large for WebP, which ends at "
+            f"{MAX_WEBP}; choose another --textures"
+        )
+    spec = oiio.ImageSpec(width, height, channels, oiio.UINT8)
+    spec.attribute("Compression", "lossless" if quality is None else f"webp:{quality}")
+    spec.attribute("oiio:UnassociatedAlpha", 1)
+    return _encode(np.ascontiguousarray(pixels), spec, ".webp")
+
+
 def encode_exr(pixels: NDArray, attributes: Mapping[str, float | str] | None = None) -> bytes:
     """OpenEXR file (32-bit float, lossless zip) of (H, W, C) linear pixels, with header
     attributes."""
@@ -170,7 +201,7 @@ def encode_exr(pixels: NDArray, attributes: Mapping[str, float | str] | None = N
 
 
 def _encode(
-    pixels: NDArray, spec, suffix: str, attributes: Mapping[str, float | str] | None
+    pixels: NDArray, spec, suffix: str, attributes: Mapping[str, float | str] | None = None
 ) -> bytes:
     import OpenImageIO as oiio
 

@@ -7,12 +7,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from appearance_opt.asset import images
 from appearance_opt.asset.alpha import coverage, kind_of
 from appearance_opt.asset.encoding import encoded_for
+from appearance_opt.asset.file_options import PLAIN
 from appearance_opt.asset.mtl import ALPHA_TEST, UNLIT_MARK, WITHOUT_MAP
 from appearance_opt.asset.paths import file_name
 from appearance_opt.asset.sides import apart_from_sides
+from appearance_opt.asset.texture_files import Slot, encode_pixels
 from appearance_opt.asset.types import Texture, linear_to_srgb
 
 if TYPE_CHECKING:
@@ -20,11 +21,13 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from appearance_opt.asset.file_options import FileOptions, MapKind
     from appearance_opt.asset.types import Asset, Material, Mesh
 
 
-def save_obj(asset: Asset, path: Path) -> None:
-    """Write OBJ, MTL (with the PBR extension: Pr, Pm, map_Pr, map_Pm, norm) and PNG textures.
+def save_obj(asset: Asset, path: Path, options: FileOptions = PLAIN) -> None:
+    """Write OBJ, MTL (with the PBR extension: Pr, Pm, map_Pr, map_Pm, norm) and PNG or JPEG
+    textures.
 
     Vertex colours follow the positions, sRGB encoded, as Blender and MeshLab write and read them;
     the format has no place for their alpha. What light passes through becomes alpha: of
@@ -37,7 +40,7 @@ def save_obj(asset: Asset, path: Path) -> None:
     }
     mtl = ["# appearance-opt"]
     for key, m in {look[id(m.material)]: m.material for m in asset.meshes}.items():
-        mtl += _mtl_lines(replace(m, name=named[key]), path)
+        mtl += _mtl_lines(replace(m, name=named[key]), path, options)
     path.with_suffix(".mtl").write_text("\n".join(mtl) + "\n", encoding="utf-8")
     lines = ["# appearance-opt", f"mtllib {path.stem}.mtl"]
     start = np.ones(
@@ -83,7 +86,7 @@ def _vertices(mesh: Mesh, origin: tuple[float, float, float]) -> list[str]:
     return lines
 
 
-def _mtl_lines(m: Material, path: Path) -> list[str]:
+def _mtl_lines(m: Material, path: Path, options: FileOptions) -> list[str]:
     """The statements of a material, whose textures are written beside ``path``.
 
     Readers differ in whether Kd, Pr and Pm multiply their maps (the Wavefront convention) or stand
@@ -91,9 +94,11 @@ def _mtl_lines(m: Material, path: Path) -> list[str]:
     factor alone, for when the map gets lost.
     """
 
-    def picture(suffix: str, pixels: NDArray) -> str:
-        target = path.with_name(f"{path.stem}_{file_name(m.name)}_{suffix}.png")
-        target.write_bytes(images.encode_png(np.ascontiguousarray(pixels)))
+    def picture(suffix: str, pixels: NDArray, kind: MapKind = "material") -> str:
+        slot = Slot(Texture(pixels), "srgb" if kind == "color" else "linear", kind)
+        file = encode_pixels(np.ascontiguousarray(pixels), options.format_of(kind), slot)
+        target = path.with_name(f"{path.stem}_{file_name(m.name)}_{suffix}{file.suffix}")
+        target.write_bytes(file.data)
         return target.name
 
     def plane(channel: int, factor: float) -> NDArray:
@@ -114,7 +119,7 @@ def _mtl_lines(m: Material, path: Path) -> list[str]:
     lines += [*constant("Pr", (m.roughness,), orm), *constant("Pm", (m.metalness,), orm)]
     if m.base_color_texture is not None:
         color = encoded_for(m.base_color_texture, "srgb", m.base_color)
-        lines.append("map_Kd " + picture("base_color", color[..., :3]))
+        lines.append("map_Kd " + picture("base_color", color[..., :3], "color"))
     if orm:
         lines.append("map_Pr " + picture("roughness", plane(1, m.roughness)))
         lines.append("map_Pm " + picture("metalness", plane(2, m.metalness)))
@@ -123,12 +128,12 @@ def _mtl_lines(m: Material, path: Path) -> list[str]:
     elif m.emits:
         lines.append("Ke " + " ".join(f"{x:.6g}" for x in m.emission))
         if m.emission_texture is not None:
-            lines.append("map_Ke " + picture("emission", encoded_for(m.emission_texture, "srgb")))
+            emission = encoded_for(m.emission_texture, "srgb")
+            lines.append("map_Ke " + picture("emission", emission, "color"))
     if m.normal_texture is not None and not m.unlit:
         strength = "" if m.normal_scale == 1 else f"-bm {m.normal_scale:.6g} "
-        lines.append(
-            f"norm {strength}" + picture("normal", encoded_for(m.normal_texture, "linear")[..., :3])
-        )
+        normals = encoded_for(m.normal_texture, "linear")[..., :3]
+        lines.append(f"norm {strength}" + picture("normal", normals, "normal"))
     factor, alpha = coverage(m)
     if factor < 1 or alpha is not None:
         # readers differ in whether d multiplies its map, too

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -137,6 +137,7 @@ class Mesh:
     ``positions`` (V, 3) float32; ``faces`` (F, 3) int32; ``normals`` (V, 3) unit or None (none in
     the file); ``uvs`` (V, 2) or None; ``tangents`` (V, 4) or None; ``colors`` (V, 3) linear vertex
     colours, (V, 4) with alpha, or None. Vertices are split at UV and normal seams, as in the file.
+    ``node``: number of the asset's node to which it belongs, None for none.
     """
 
     positions: NDArray[np.float32]
@@ -147,6 +148,29 @@ class Mesh:
     colors: NDArray[np.float32] | None = None
     material: Material = field(default_factory=Material)
     name: str = "mesh"
+    node: int | None = None
+
+
+@dataclass(frozen=True)
+class Node:
+    """A node of a file's hierarchy: a part that an engine knows by its name and moves about its
+    pivot, the origin of its coordinates. ``parent``: number of the node above it, smaller than its
+    own; None at the top. ``matrix``: (4, 4) double precision, from its coordinates to its parent's,
+    of columns (y = M x). ``extras``: what the file's authors say of it (JSON values), or None."""
+
+    name: str
+    parent: int | None = None
+    matrix: NDArray[np.float64] = field(default_factory=lambda: np.eye(4))
+    extras: Any = None
+
+
+@dataclass(frozen=True)
+class Credits:
+    """What a file says of itself. ``copyright``: the line that its owners ask to be shown;
+    ``extras``: other values of its authors (JSON), or None."""
+
+    copyright: str = ""
+    extras: Any = None
 
 
 @dataclass(frozen=True)
@@ -164,7 +188,9 @@ class Asset:
     """All meshes of one file, node transforms applied. ``notes`` lists, one line each, what the
     loader dropped, repaired or assumed; ``files``, absolute paths of the files that it refers to;
     ``origin``: the place of the meshes in the world, which is origin + positions (metres, double
-    precision), zero but for what lies far away for its size."""
+    precision), zero but for what lies far away for its size; ``nodes``, a parent before its
+    children: the hierarchy of the meshes, whose transforms are applied already, empty for one mesh
+    beside the other."""
 
     meshes: tuple[Mesh, ...]
     name: str = "asset"
@@ -172,6 +198,8 @@ class Asset:
     files: tuple[Path, ...] = ()
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
     contents: Contents = field(default_factory=Contents)
+    nodes: tuple[Node, ...] = ()
+    credits: Credits = field(default_factory=Credits)
 
     @property
     def triangle_count(self) -> int:

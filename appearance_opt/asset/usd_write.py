@@ -10,29 +10,30 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from appearance_opt.asset import images
 from appearance_opt.asset.alpha import coverage, kind_of
 from appearance_opt.asset.encoding import encoded_for
+from appearance_opt.asset.file_options import PLAIN
 from appearance_opt.asset.height import as_16_bit, height_png
 from appearance_opt.asset.paths import MAX_NAME
 from appearance_opt.asset.rows import unique_rows
 from appearance_opt.asset.sides import apart_from_sides
+from appearance_opt.asset.texture_files import Slot, TextureFile, encode, encode_pixels
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from appearance_opt.asset.file_options import FileOptions
     from appearance_opt.asset.types import Asset, ColorSpace, Material, Mesh, Texture
 
-_SPACES: dict[str, ColorSpace] = {"sRGB": "srgb", "raw": "linear"}
-"""Our names of UsdUVTexture's colour spaces."""
-
+_SPACES: dict[ColorSpace, str] = {"srgb": "sRGB", "linear": "raw"}
+"""UsdUVTexture's names of our colour spaces."""
 
 SIBLINGS = 500
 """Meshes that lie below one prim."""
 
 
-def save_usd(asset: Asset, path: Path) -> None:
-    """Write .usd, .usda or .usdc with PNG files in ``<stem>_textures/``, or one .usdz package. Y
+def save_usd(asset: Asset, path: Path, options: FileOptions = PLAIN) -> None:
+    """Write .usd, .usda or .usdc with PNG or JPEG files in ``<stem>_textures/``, or one .usdz package. Y
     up, metres. Vertex colours, times the base colour, are read by the surface where it has no
     texture of that; a UsdPreviewSurface cannot multiply the two. What light passes through becomes
     opacity: of ``alpha.coverage``. Raises OSError when the disk refuses."""
@@ -43,7 +44,7 @@ def save_usd(asset: Asset, path: Path) -> None:
     folder = Path(tempfile.mkdtemp(dir=path.parent)) if package else path.parent
     try:
         root = folder / (path.stem + (".usdc" if package else path.suffix))
-        _write_stage(asset, root, f"{path.stem}_textures")
+        _write_stage(asset, root, f"{path.stem}_textures", options)
         if package and not UsdUtils.CreateNewUsdzPackage(Sdf.AssetPath(str(root)), str(path)):
             raise OSError(errno.EIO, "the USDZ package could not be written", str(path))
     except Tf.ErrorException as error:  # USD has its own exceptions for what the system reports
@@ -54,7 +55,7 @@ def save_usd(asset: Asset, path: Path) -> None:
             shutil.rmtree(folder, ignore_errors=True)
 
 
-def _write_stage(asset: Asset, root: Path, textures: str) -> None:
+def _write_stage(asset: Asset, root: Path, textures: str, options: FileOptions) -> None:
     from pxr import Gf, Kind, Tf, Usd, UsdGeom
 
     stage = Usd.Stage.CreateNew(str(root))
@@ -73,9 +74,8 @@ def _write_stage(asset: Asset, root: Path, textures: str) -> None:
         if key not in materials:
             word = Tf.MakeValidIdentifier(mesh.material.name)[:MAX_NAME]
             target = f"/{name}/Materials/M{len(materials)}_{word}"
-            materials[key] = _material(
-                stage, target, mesh.material, root.parent / textures, key[1], key[2]
-            )
+            preview = _Preview(stage, target, root.parent / textures, options)
+            materials[key] = _material(preview, mesh.material, key[1], key[2])
         parent = _parent(stage, name, k, len(asset.meshes))
         _mesh(stage, f"{parent}/G{k}_{Tf.MakeValidIdentifier(mesh.name)}", mesh, materials[key])
     stage.GetRootLayer().Save()
@@ -170,13 +170,8 @@ def _distinct(values: NDArray[np.float32]) -> tuple[NDArray[np.intp], NDArray[np
     return first[order], rank[kind]
 
 
-def _material(
-    stage: Any, target: str, m: Material, folder: Path, colored: bool, veiled: bool
-) -> Any:
-    from pxr import UsdShade
-
-    material = UsdShade.Material.Define(stage, target)
-    preview = _Preview(stage, target, folder)
+def _material(preview: _Preview, m: Material, colored: bool, veiled: bool) -> Any:
+    material = preview.material
     material.CreateSurfaceOutput().ConnectToSource(preview.shader.ConnectableAPI(), "surface")
     shown = "diffuseColor"
     if m.unlit:
@@ -193,14 +188,14 @@ def _material(
     preview.opacity(m, veiled)
     if m.normal_texture is not None and not m.unlit:
         s = m.normal_scale
-        node = preview.sampler(
-            "normal", m.normal_texture, "raw", (2 * s, 2 * s, 2, 1), (-s, -s, -1, 0)
-        )
+        slot = Slot(m.normal_texture, "linear", "normal")
+        node = preview.sampler("normal", slot, (2 * s, 2 * s, 2, 1), (-s, -s, -1, 0))
         preview.connect("normal", "Normal3f", node, "rgb")
     if m.displacement is not None:
         d = as_16_bit(m.displacement)
         scale, bias = (d.scale,) * 3 + (1,), (-d.mid * d.scale,) * 3 + (0,)
-        node = preview.sampler("displacement", d.texture, "raw", scale, bias, height_png(d))
+        slot = Slot(d.texture, "linear", "material")
+        node = preview.sampler("displacement", slot, scale, bias, TextureFile(height_png(d), "png"))
         preview.connect("displacement", "Float", node, "r")
         material.CreateDisplacementOutput().ConnectToSource(
             preview.shader.ConnectableAPI(), "displacement"
@@ -209,13 +204,15 @@ def _material(
 
 
 class _Preview:
-    """A UsdPreviewSurface and the samplers of its textures, which are written to ``folder``."""
+    """A material of a UsdPreviewSurface and the samplers of its textures, which are written to
+    ``folder``."""
 
-    def __init__(self, stage: Any, target: str, folder: Path) -> None:
-        from pxr import Sdf
+    def __init__(self, stage: Any, target: str, folder: Path, options: FileOptions) -> None:
+        from pxr import Sdf, UsdShade
 
-        self.stage, self.target, self.folder = stage, target, folder
+        self.stage, self.target, self.folder, self.options = stage, target, folder, options
         self.types = Sdf.ValueTypeNames
+        self.material = UsdShade.Material.Define(stage, target)
         self.shader = self._node("Surface", "UsdPreviewSurface")
         self.reader = self._node("st", "UsdPrimvarReader_float2")
         self.reader.CreateInput("varname", self.types.String).Set("st")
@@ -230,29 +227,27 @@ class _Preview:
     def sampler(
         self,
         key: str,
-        texture: Texture,
-        space: str,
+        slot: Slot,
         scale: tuple[float, ...] | None = None,
         bias: tuple[float, ...] | None = None,
-        data: bytes | None = None,
+        encoded: TextureFile | None = None,
     ) -> Any:
-        """A node that reads ``texture``, written as ``data`` if that is given."""
+        """A node that reads the texture of a slot, written as ``encoded`` if that is given."""
         from pxr import Gf, Sdf
 
-        file = self.folder / f"{self.target.rsplit('/', 1)[1]}_{key}.png"
+        encoded = encoded or encode(slot, self.options.format_of(slot.kind))
+        file = self.folder / f"{self.target.rsplit('/', 1)[1]}_{key}{encoded.suffix}"
         self.folder.mkdir(exist_ok=True)
-        file.write_bytes(
-            images.encode_png(encoded_for(texture, _SPACES[space])) if data is None else data
-        )
+        file.write_bytes(encoded.data)
         node = self._node(key, "UsdUVTexture")
         node.CreateInput("file", self.types.Asset).Set(
             Sdf.AssetPath(f"./{self.folder.name}/{file.name}")
         )
-        node.CreateInput("sourceColorSpace", self.types.Token).Set(space)
+        node.CreateInput("sourceColorSpace", self.types.Token).Set(_SPACES[slot.space])
         node.CreateInput("st", self.types.Float2).ConnectToSource(
             self.reader.ConnectableAPI(), "result"
         )
-        for axis, wrap in zip("ST", texture.wrap, strict=True):
+        for axis, wrap in zip("ST", slot.texture.wrap, strict=True):
             node.CreateInput(f"wrap{axis}", self.types.Token).Set(wrap)
         for name, value in (("scale", scale), ("bias", bias)):
             if value is not None:
@@ -274,7 +269,8 @@ class _Preview:
             self.shader.CreateInput(name, self.types.Color3f).Set(Gf.Vec3f(*factor))
             return
         scale = None if tuple(factor) == (1.0, 1.0, 1.0) else (*factor, 1.0)
-        self.connect(name, "Color3f", self.sampler(key, texture, "sRGB", scale), "rgb")
+        slot = Slot(texture, "srgb", "color")
+        self.connect(name, "Color3f", self.sampler(key, slot, scale), "rgb")
 
     def primvar(self, name: str, kind: str, node: str, primvar: str) -> None:
         """An input that is a primvar of the mesh."""
@@ -299,9 +295,8 @@ class _Preview:
             self.shader.CreateInput("metallic", self.types.Float).Set(m.metalness)
             return
         plain = (m.roughness, m.metalness) == (1.0, 1.0)
-        node = self.sampler(
-            "orm", m.orm_texture, "raw", None if plain else (1.0, m.roughness, m.metalness, 1.0)
-        )
+        slot = Slot(m.orm_texture, "linear", "material", not m.has_occlusion)
+        node = self.sampler("orm", slot, None if plain else (1.0, m.roughness, m.metalness, 1.0))
         self.connect("roughness", "Float", node, "g")
         self.connect("metallic", "Float", node, "b")
         if m.has_occlusion:
@@ -318,10 +313,10 @@ class _Preview:
         elif texture is None:
             self.shader.CreateInput("opacity", self.types.Float).Set(factor)
         else:
-            pixels = images.encode_png(encoded_for(texture, "linear", (factor,)))
-            self.connect(
-                "opacity", "Float", self.sampler("opacity", texture, "raw", data=pixels), "r"
-            )
+            slot = Slot(texture, "linear", "material")
+            pixels = encoded_for(texture, "linear", (factor,))
+            encoded = encode_pixels(pixels, self.options.material, slot)
+            self.connect("opacity", "Float", self.sampler("opacity", slot, encoded=encoded), "r")
         if kind_of(m) == "mask":
             self.shader.CreateInput("opacityThreshold", self.types.Float).Set(m.alpha_cutoff)
         else:  # its highlights are covered as the rest of it is, as in glTF

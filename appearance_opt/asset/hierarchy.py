@@ -1,0 +1,127 @@
+"""The nodes of an asset: where they are, and meshes in their coordinates and back."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from appearance_opt.asset.instances import Instances, place_copies
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+
+    from numpy.typing import NDArray
+
+    from appearance_opt.asset.types import Asset, Mesh, Node
+
+SHEAR = 1e-5
+"""By how much translation, rotation and scale may miss a matrix, relative to its largest number:
+more than rounding in a file of single precision."""
+
+
+@dataclass(frozen=True)
+class Transform:
+    """Translation, rotation (a unit quaternion x, y, z, w) and scale: what engines keep of a
+    node."""
+
+    translation: tuple[float, ...] = (0.0, 0.0, 0.0)
+    rotation: tuple[float, ...] = (0.0, 0.0, 0.0, 1.0)
+    scale: tuple[float, ...] = (1.0, 1.0, 1.0)
+
+
+def place_nodes(nodes: Sequence[Node]) -> tuple[list[Transform], NDArray[np.float64]]:
+    """(the transform of each node relative to its parent; (N, 4, 4) to the world).
+
+    A transform that shears, or flattens space, is none that glTF has for nodes (2.0, 3.5.3) or an
+    engine keeps: its node keeps its place alone, and what hangs below it keeps its own.
+    """
+    wanted = np.empty((len(nodes), 4, 4))
+    world = np.empty((len(nodes), 4, 4))
+    transforms = []
+    for k, node in enumerate(nodes):
+        above = np.eye(4) if node.parent is None else world[node.parent]
+        wanted[k] = node.matrix if node.parent is None else wanted[node.parent] @ node.matrix
+        local = np.linalg.solve(above, wanted[k])
+        found = decompose(local)
+        if found is None:
+            found = Transform(tuple(local[:3, 3].tolist()))
+        transforms.append(found)
+        world[k] = above @ compose_one(found)
+    return transforms, world
+
+
+def decompose(matrix: NDArray) -> Transform | None:
+    """A (4, 4) matrix as translation, rotation and scale; None if it is singular, or they cannot
+    make it. A reflection becomes a negative scale along x."""
+    from scipy.spatial.transform import Rotation
+
+    linear = matrix[:3, :3]
+    scale = np.linalg.norm(linear, axis=0)
+    most = float(scale.max())
+    if not np.isfinite(matrix).all() or scale.min() <= SHEAR * most or most == 0:
+        return None
+    if np.linalg.det(linear) < 0:
+        scale[0] = -scale[0]
+    axes = linear / scale
+    if np.abs(axes.T @ axes - np.eye(3)).max() > SHEAR:
+        return None
+    out = Transform(tuple(matrix[:3, 3].tolist()), scale=tuple(scale.tolist()))
+    if np.array_equal(axes, np.eye(3)):
+        return out
+    return replace(out, rotation=tuple(Rotation.from_matrix(axes).as_quat().tolist()))
+
+
+def compose_one(t: Transform) -> NDArray[np.float64]:
+    """The (4, 4) matrix of a transform."""
+    from scipy.spatial.transform import Rotation
+
+    out = np.eye(4)
+    out[:3, :3] = Rotation.from_quat(t.rotation).as_matrix() * np.array(t.scale)
+    out[:3, 3] = t.translation
+    return out
+
+
+def in_coordinates(mesh: Mesh, world: NDArray, origin: Sequence[float]) -> Mesh:
+    """A mesh of the world, at ``origin``, in the coordinates of a node that ``world`` (4, 4) brings
+    to the world. Positions in single precision."""
+    back = np.linalg.inv(world) @ _translation(origin)
+    if np.array_equal(back, np.eye(4)):
+        return mesh
+    put = place_copies(mesh, Instances(back[None]), mesh.name)
+    return replace(put, positions=put.positions.astype(np.float32), node=mesh.node)
+
+
+def _translation(offset: Sequence[float]) -> NDArray[np.float64]:
+    out = np.eye(4)
+    out[:3, 3] = offset
+    return out
+
+
+def group_by_node(asset: Asset) -> dict[int | None, list[int]]:
+    """Numbers of the meshes of each node of an asset; those of no node below None."""
+    groups: dict[int | None, list[int]] = {}
+    for k, mesh in enumerate(asset.meshes):
+        groups.setdefault(mesh.node if asset.nodes else None, []).append(k)
+    return groups
+
+
+def without_idle_nodes(asset: Asset, kept: Iterable[int] = ()) -> Asset:
+    """An asset without the nodes that lead neither to a mesh nor to one of those ``kept``."""
+    used = {m.node for m in asset.meshes if m.node is not None} | set(kept)
+    for k in reversed(range(len(asset.nodes))):
+        parent = asset.nodes[k].parent
+        if k in used and parent is not None:
+            used.add(parent)
+    if len(used) == len(asset.nodes):
+        return asset
+    number = {old: new for new, old in enumerate(sorted(used))}
+    nodes = (asset.nodes[k] for k in number)
+    return replace(
+        asset,
+        nodes=tuple(n if n.parent is None else replace(n, parent=number[n.parent]) for n in nodes),
+        meshes=tuple(
+            m if m.node is None else replace(m, node=number[m.node]) for m in asset.meshes
+        ),
+    )
