@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import json
-import shutil
 import struct
-import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -16,7 +14,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from appearance_opt.asset import load, save
-from appearance_opt.asset.tangents import split_and_tangents
 from appearance_opt.asset.types import Asset, Material, Mesh
 from appearance_opt.errors import InputError
 
@@ -332,7 +329,7 @@ def test_without_the_package_meshopt_names_it_or_takes_the_fallback(
     points, _, faces = QUAD
     (tmp_path / "plain.bin").write_bytes(points.tobytes() + faces.astype(np.uint16).tobytes())
     monkeypatch.setitem(sys.modules, "meshopt", None)
-    with pytest.raises(InputError, match=r"pip install 'appearance-opt\[meshopt\]'"):
+    with pytest.raises(InputError, match=r"pip install meshopt"):
         load(tmp_path / "alone.glb")
     mesh = load(tmp_path / "both.glb").meshes[0]
     np.testing.assert_array_equal(mesh.positions[mesh.faces], points[faces])
@@ -352,41 +349,6 @@ def test_a_degenerate_face_is_dropped_with_a_note(tmp_path: Path, ball: Asset) -
     again = load(tmp_path / "x.glb")
     assert again.triangle_count == len(mesh.faces)
     assert any("1 degenerate" in n for n in again.notes)
-
-
-def test_output_passes_the_khronos_validator(tmp_path: Path, ball: Asset) -> None:
-    node = shutil.which("node")
-    found = node and subprocess.run(
-        [node, "-e", "require.resolve('gltf-validator')"],
-        capture_output=True,
-        cwd=Path(__file__).parents[1],
-    )
-    if not found or found.returncode:
-        pytest.skip("node with the package gltf-validator is not there")
-    mesh = ball.meshes[0]
-    index, faces, tangents = split_and_tangents(mesh.positions, mesh.normals, mesh.uvs, mesh.faces)
-    full = replace(
-        mesh,
-        positions=mesh.positions[index],
-        normals=mesh.normals[index],
-        uvs=mesh.uvs[index],
-        faces=faces,
-        tangents=tangents,
-    )
-    save(Asset((full,)), tmp_path / "x.glb")
-    script = (
-        "require('gltf-validator').validateBytes(new Uint8Array(require('fs').readFileSync(process.argv[1])))"
-        ".then(r => console.log(JSON.stringify(r.issues)))"
-    )
-    out = subprocess.run(
-        [node, "-e", script, str(tmp_path / "x.glb")],
-        capture_output=True,
-        text=True,
-        check=True,
-        cwd=Path(__file__).parents[1],
-    )
-    issues = json.loads(out.stdout)
-    assert issues["numErrors"] == 0, issues["messages"][:3]
 
 
 def test_real_helmet_becomes_one_scene(assets_dir: Path) -> None:

@@ -28,13 +28,17 @@ GLTF, USD, OBJ = (".glb", ".gltf"), (".usd", ".usda", ".usdc", ".usdz"), (".obj"
 QUALITY: dict[MapKind, int] = {"color": 90, "normal": 95, "material": 90}
 """Of lossy codecs, where none is given: an error of a normal moves highlights."""
 
+WEB = "color=webp:80,normal=jpeg:80,material=webp:80"
+"""Lossy WebP halves the resolution of colour differences, and normals are such: at any quality it
+costs 0.5 dB on flight_helmet, where JPEG, which need not do so, costs 0.1."""
+
 _MODES: dict[Codec, tuple[Mode, ...]] = {
     "png": ("lossless",),
     "jpeg": ("lossy",),
     "webp": ("lossy", "lossless"),
     "ktx2": ("etc1s", "uastc"),
 }
-"""Of each codec, the first one by default (of KTX 2.0, for colours only)."""
+"""Of each codec, the first one by default, but for what ``_default`` says."""
 
 _HELD: dict[tuple[str, ...], tuple[Codec, ...]] = {
     GLTF: CODECS,
@@ -46,11 +50,11 @@ _HELD: dict[tuple[str, ...], tuple[Codec, ...]] = {
 @dataclass(frozen=True)
 class TextureFormat:
     """How the maps of one kind are stored. ``quality``: 1 to 100, of modes that lose something,
-    heeded by "lossy" and "etc1s". PNG keeps 16 bits where a map has them; the others hold 8."""
+    100 for the others. PNG keeps 16 bits where a map has them; the others hold 8."""
 
     codec: Codec = "png"
     mode: Mode = "lossless"
-    quality: int = 90
+    quality: int = 100
 
 
 PNG = TextureFormat()
@@ -134,7 +138,7 @@ def _parse_format(value: str, kind: MapKind, text: str) -> TextureFormat:
     if codec is None:
         raise _wrong(text, f"'{name}' is no codec; choose from {', '.join(CODECS)}")
     modes = _MODES[codec]
-    mode = "uastc" if codec == "ktx2" and kind != "color" else modes[0]
+    mode = _default(codec, kind)
     quality = QUALITY[kind]
     if colon:
         found = next((m for m in modes if m == detail), None)
@@ -146,7 +150,15 @@ def _parse_format(value: str, kind: MapKind, text: str) -> TextureFormat:
             known = [m for m in modes if m != "lossy"]
             choice = known if codec == "png" else ["a quality of 1 to 100", *known]
             raise _wrong(text, f"'{detail}' behind {codec}: choose {' or '.join(choice)}")
-    return TextureFormat(codec, mode, quality)
+    return TextureFormat(codec, mode, quality if mode in ("lossy", "etc1s") else 100)
+
+
+def _default(codec: Codec, kind: MapKind) -> Mode:
+    """ETC1S has one pair of colours for a block of texels, which what is no colour does not have;
+    of lossy WebP see ``WEB``."""
+    if codec == "ktx2" and kind != "color":
+        return "uastc"
+    return "lossless" if codec == "webp" and kind == "normal" else _MODES[codec][0]
 
 
 def _wrong(text: str, reason: str) -> InputError:
@@ -156,7 +168,8 @@ def _wrong(text: str, reason: str) -> InputError:
 def for_target(target: Target, path: Path) -> FileOptions:
     """What suits a use, as far as the format of ``path`` can hold it and this machine can write it.
 
-    "web": few bytes, WebP (JPEG in USD and OBJ), quantised and compressed vertices. "game": KTX 2.0
+    "web": few bytes, WebP, normals as JPEG (all of them in USD and OBJ), quantised and compressed
+    vertices. "game": KTX 2.0
     if an encoder is installed, which stays compressed in the memory of a GPU, and quantised
     vertices; else PNG, which engines compress themselves when they import it. "film": nothing is
     lost: PNG, 32-bit floats.
@@ -164,7 +177,7 @@ def for_target(target: Target, path: Path) -> FileOptions:
     gltf = path.suffix.lower() in GLTF
     if target == "web":
         compress: Compression = "meshopt" if gltf and _has_meshopt() else "none"
-        return replace(parse_textures("webp" if gltf else "jpeg"), quantize=gltf, compress=compress)
+        return replace(parse_textures(WEB if gltf else "jpeg:80"), quantize=gltf, compress=compress)
     if target == "game" and gltf:
         return replace(parse_textures("ktx2" if ktx2.encoder() else "png"), quantize=True)
     return PLAIN

@@ -50,6 +50,8 @@ class MaterialReader:
         self.document, self.path = document, document.path
         self.note = document.companions.note
         self._images: dict[int, NDArray | None] = {}
+        # what several materials read is one texture, as in the file
+        self._read_textures: dict[tuple[int, str, tuple[Wrap, Wrap]], Texture] = {}
         self._materials: dict[int | None, tuple[Material, list[int]]] = {}
         self._transforms: dict[int, dict[str, uv_transforms.UvTransform]] = {}
         self._tiles: dict[int, Callable[[Tile], Material]] = {}
@@ -312,6 +314,8 @@ class MaterialReader:
         if pixels is None:
             return None
         read = Texture(images.to_color(pixels), space, wrap)  # type: ignore[arg-type]
+        if name is None and source is not None:
+            return self._read_textures.setdefault((source, space, wrap), read)
         if name is None or self._tile is None:
             return read
         return udim.fit_to_tile(read, self._tile, self.document.companions)

@@ -1,6 +1,6 @@
 """Buffer views that glTF holds compressed by meshoptimizer (EXT_meshopt_compression and its
-successor KHR_meshopt_compression: what ``gltfpack -c`` writes), through the optional package
-meshopt."""
+successor KHR_meshopt_compression: what ``gltfpack -c`` writes), through the package meshopt, which
+Python 3.10 lacks."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def decompress(data: bytes, view: dict[str, Any], where: str) -> bytes:
     except ImportError:
         raise PackageMissing(
             f"{where}: meshopt compression needs the package meshopt (Python 3.11 and later): "
-            "pip install 'appearance-opt[meshopt]' (or save the file uncompressed, with gltfpack without -c)"
+            "pip install meshopt (or save the file uncompressed, with gltfpack without -c)"
         ) from None
     count, stride = view["count"], view["byteStride"]
     if count < 0 or count * stride > _MOST * len(data):

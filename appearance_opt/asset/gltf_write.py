@@ -138,15 +138,14 @@ class _Writer:
                 for k in members
             ]
             self._hang(meshes, nodes[number], nodes)
-        self.json["scenes"] = [{"nodes": tops}]
+        grid, first = self._grid(loose), len(nodes)
+        nodes += [{"name": m.name, **self._shown([m], m.name, grid)} for m in loose]
+        beside = list(range(first, len(nodes)))
         if loose and any(asset.origin):
-            nodes.append({"name": asset.name, "translation": list(asset.origin), "children": []})
-            tops.append(len(nodes) - 1)
-            tops = nodes[-1]["children"]
-        grid = self._grid(loose)
-        for mesh in loose:
-            tops.append(len(nodes))
-            nodes.append({"name": mesh.name, **self._shown([mesh], mesh.name, grid)})
+            root = {"name": asset.name, "translation": list(asset.origin), "children": beside}
+            nodes.append(root)
+            beside = [len(nodes) - 1]
+        self.json["scenes"] = [{"nodes": tops + beside}]
 
     def _hang(self, meshes: list[Mesh], node: dict[str, Any], nodes: list[dict[str, Any]]) -> None:
         """Let a node show meshes in its coordinates. What undoes a grid gets a node of its own

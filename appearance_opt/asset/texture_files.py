@@ -84,7 +84,7 @@ def encode_pixels(pixels: NDArray, wanted: TextureFormat, slot: Slot) -> Texture
         return TextureFile(images.encode_jpeg(pixels, wanted.quality), "jpeg")
     if wanted.codec == "webp":
         quality = None if wanted.mode == "lossless" else wanted.quality
-        return TextureFile(images.encode_webp(images.to_color(pixels), quality), "webp")
+        return TextureFile(images.encode_webp(_visible(images.to_color(pixels)), quality), "webp")
     data = ktx2.encode(
         images.to_color(pixels),
         slot.space,
@@ -100,3 +100,11 @@ def _without_plain_alpha(pixels: NDArray) -> NDArray:
     if pixels.shape[2] in (2, 4) and bool((pixels[..., -1] == np.iinfo(pixels.dtype).max).all()):
         return pixels[..., :-1]
     return pixels
+
+
+def _visible(pixels: NDArray) -> NDArray:
+    """Pixels whose alpha is at least one step of 255: WebP's encoder gives up the colours under
+    zero, which filters mix into what lies beside it."""
+    if pixels.shape[2] != 4:
+        return pixels
+    return np.concatenate([pixels[..., :3], np.maximum(pixels[..., 3:], 1)], axis=2)
