@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from appearance_opt.asset.tangents import split_and_tangents
-from appearance_opt.fit.model import Model, Rates
 from appearance_opt.initial.sphere import sphere
+from appearance_opt.latent.build import latent_of
+from appearance_opt.latent.parameter import Rates
 from appearance_opt.render import coverage, gradient
 from appearance_opt.render.images import render_image
 from appearance_opt.render.lattice import sub_pixel_offsets
@@ -56,7 +57,7 @@ def test_half_plane_area_is_exact() -> None:
 def test_silhouettes_know_the_coverage_of_their_pixels() -> None:
     mesh = sphere(1200, (0.0, 0.0, 0.0), 0.7, 16)
     constants = {"red": 0.6, "green": 0.3, "blue": 0.2, "roughness": 0.5, "metalness": 0.2}
-    model = Model(mesh, constants, frozenset(("shape",)), Rates())
+    model = latent_of(mesh, constants, frozenset(("shape",)), Rates())
     grid, records = Grid(2, 64), ViewSampler((0.0, 0.0, 0.0), 1.0, seed=5).draw(0, 2).records()
     drawn, batch = drawn_of(model), Batch(records, grid)
     quality = Quality(4.0, 4, 1)

@@ -23,10 +23,11 @@ from appearance_opt.baking.texel_points import TexelPoints
 from appearance_opt.config import BakeOptions, bake_options, read_toml, with_values
 from appearance_opt.errors import InputError
 from appearance_opt.evaluate.metrics import compare_images
-from appearance_opt.fit.model import Model, Rates
 from appearance_opt.initial.sphere import sphere
 from appearance_opt.jobs.bake import bake
+from appearance_opt.latent.build import latent_of
 from appearance_opt.latent.mesh import LatentMesh
+from appearance_opt.latent.parameter import Rates
 from appearance_opt.reference.curvature import mean_curvature
 from appearance_opt.reference.mesh import MeshReference
 from appearance_opt.reference.survey import MeshSurvey
@@ -267,7 +268,7 @@ def test_a_latent_with_its_own_normals_is_drawn_as_the_asset() -> None:
     n = big.astype(np.float32) / 255 * 2 - 1
     maps = {"red": 0.8, "green": 0.5, "blue": 0.3, "roughness": 0.5, "metalness": 0.0}
     maps.update({f"normal_{a}": n[..., k] for k, a in enumerate("xyz")})
-    model = Model(low.mesh, maps, frozenset(["normal"]), Rates())
+    model = latent_of(low.mesh, maps, frozenset(["normal"]), Rates())
     views = ViewSampler((0.0, 0.0, 0.0), 0.9).draw(0, 3)
     ours = render_image(drawn_of(model), Batch(views.records(), Grid(3, 64)), 4)
     theirs = MeshReference(low.asset).render(views, 64, 4)

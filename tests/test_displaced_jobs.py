@@ -19,16 +19,18 @@ from appearance_opt.baking.target_mesh import movable, prepare
 from appearance_opt.config import bake_options, joint_options, simplify_options
 from appearance_opt.errors import InputError
 from appearance_opt.fit import loop
-from appearance_opt.fit.loop import FitOptions, level_of
-from appearance_opt.fit.model import POSITIONS, TEXELS, Model, Rates
+from appearance_opt.fit.loop import FitOptions, pose_of
 from appearance_opt.fit.validation import Validation
 from appearance_opt.initial.sphere import sphere
 from appearance_opt.jobs.joint import joint
 from appearance_opt.jobs.result import SimplifyResult
 from appearance_opt.jobs.simplify import simplify
+from appearance_opt.latent.build import latent_of
 from appearance_opt.latent.displacement import DISPLACEMENT, Tessellator, footprint
+from appearance_opt.latent.parameter import Rates
+from appearance_opt.latent.positions import POSITIONS
 from appearance_opt.latent.subdivision import tessellate
-from appearance_opt.latent.texels import TexelCodec
+from appearance_opt.latent.texels import TEXELS, TexelCodec
 from appearance_opt.reference.mesh import MeshReference
 from appearance_opt.reference.pool import ReferencePool
 from appearance_opt.reference.survey import MeshSurvey
@@ -86,10 +88,10 @@ def test_levels_are_read_in_every_way_and_checked() -> None:
 
 
 def test_the_level_of_an_iteration_can_be_replayed() -> None:
-    drawn = [level_of((1, 2, 3), 5, k) for k in range(300)]
-    assert drawn == [level_of((1, 2, 3), 5, k) for k in range(300)]
+    drawn = [pose_of((1, 2, 3), 5, k) for k in range(300)]
+    assert drawn == [pose_of((1, 2, 3), 5, k) for k in range(300)]
     assert min(np.bincount(drawn)[1:]) > 70  # each in about a third of the steps
-    assert {level_of((2,), 5, k) for k in range(9)} == {2}
+    assert {pose_of((2,), 5, k) for k in range(9)} == {2}
 
 
 def test_too_much_is_refused_with_the_number(bumpy: Asset, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -167,9 +169,7 @@ def test_files_of_a_displaced_result(bumpy: Asset, tmp_path: Path) -> None:
     mesh = movable(prepare(base).mesh)
     codec = TexelCodec((DISPLACEMENT,), len(heights))
     layer = codec.layer(codec.encode({DISPLACEMENT: heights}))
-    again = np.array(Tessellator(mesh, 2, False)(mi.Float(mesh.positions.ravel()), layer)).reshape(
-        -1, 3
-    )
+    again = np.array(Tessellator(mesh, 2)(mi.Float(mesh.positions.ravel()), layer)).reshape(-1, 3)
     theirs = levels[2].meshes[0].positions
     distance = np.array([np.linalg.norm(theirs - p, axis=1).min() for p in again])
     # rounding of 16 bits: half of scale / 65535; measured 0.6 of it in the mean of a lookup
@@ -204,10 +204,12 @@ def test_what_is_not_there_has_no_parameter(bumpy: Asset, flat: SimplifyResult) 
     mesh = movable(prepare(result.asset).mesh)
     level = np.zeros((16, 16), np.float32)
     maps = {"red": level, "displacement": level}
-    assert set(Model(mesh, maps, frozenset({"displacement"}), Rates(), (1,)).parameters) == {
+    assert set(latent_of(mesh, maps, frozenset({"displacement"}), Rates(), (1,)).parameters) == {
         DISPLACEMENT
     }
-    assert set(Model(mesh, maps, frozenset({"shape", "material"}), Rates(), (1,)).parameters) == {
+    assert set(
+        latent_of(mesh, maps, frozenset({"shape", "material"}), Rates(), (1,)).parameters
+    ) == {
         POSITIONS,
         TEXELS,
     }
@@ -245,7 +247,7 @@ def test_changing_levels_compiles_nothing_after_the_first_steps(bumpy: Asset) ->
     level = np.zeros((32, 32), np.float32)
     maps = {"red": level + 0.5, "green": level + 0.5, "blue": level + 0.5, DISPLACEMENT: level}
     mesh = sphere(150, (0.0, 0.0, 0.0), 1.0, 32)
-    model = Model(mesh, maps, frozenset({"shape", "material", DISPLACEMENT}), Rates(), (1, 2))
+    model = latent_of(mesh, maps, frozenset({"shape", "material", DISPLACEMENT}), Rates(), (1, 2))
     validation = Validation(reference, sampler.held_out(1).draw(0, 2), 32)
     fit_options = FitOptions(steps=1000)
     run = loop._Run(
@@ -253,7 +255,7 @@ def test_changing_levels_compiles_nothing_after_the_first_steps(bumpy: Asset) ->
     )
     assert settles(run)
     levels = {
-        loop.level_of(model.levels, fit_options.seed, run.state.iteration - k)
+        pose_of(model.poses, fit_options.seed, run.state.iteration - k).level
         for k in range(1, BLOCK + 1)
     }
     assert levels == {1, 2}  # the clean steps changed levels

@@ -11,12 +11,16 @@ from scipy.ndimage import distance_transform_edt
 from appearance_opt.asset.normals import weld
 from appearance_opt.baking.texel_points import texel_coverage
 from appearance_opt.fit.losses import LOSSES
-from appearance_opt.fit.model import POSITIONS, TEXELS, Model, Rates
 from appearance_opt.fit.step import Gradients, StepInputs
 from appearance_opt.initial.sphere import sphere
+from appearance_opt.latent.build import latent_of
 from appearance_opt.latent.displacement import DISPLACEMENT, Tessellator, footprint, share
+from appearance_opt.latent.latent import Latent
+from appearance_opt.latent.mesh import LatentTopology
+from appearance_opt.latent.parameter import Rates
+from appearance_opt.latent.positions import POSITIONS
 from appearance_opt.latent.subdivision import tessellate
-from appearance_opt.latent.texels import TexelCodec
+from appearance_opt.latent.texels import TEXELS, TexelCodec, Texels
 from appearance_opt.reference.pool import Targets
 from appearance_opt.render.pixels import Grid
 from appearance_opt.render.quality import Quality
@@ -104,8 +108,8 @@ def test_texture_coordinates_stay_in_their_charts(level: int) -> None:
 @pytest.mark.parametrize("level", LEVELS)
 def test_no_crack_opens_at_any_level(level: int) -> None:
     mesh = ball()
-    tessellator = Tessellator(mesh, level, tangents=False)
-    fine = tessellator.topology.mesh
+    tessellator = Tessellator(mesh, level)
+    fine = tessellator.mesh
     p = posed(tessellator, mesh, noise())
     assert (edge_uses(fine.faces) == 2).all()
     # as a file holds it: a vertex for each chart, joined by nothing but equal positions
@@ -125,8 +129,8 @@ def test_no_crack_opens_at_any_level(level: int) -> None:
 def test_displacement_follows_the_interpolated_normal() -> None:
     mesh = sphere(1200, (0.0, 0.0, 0.0), 1.0, SIZE)
     for level in (0, 2):
-        tessellator = Tessellator(mesh, level, tangents=False)
-        flat = tessellator.topology.mesh.positions
+        tessellator = Tessellator(mesh, level)
+        flat = tessellator.mesh.positions
         p = posed(tessellator, mesh, np.full((SIZE, SIZE), 0.25, np.float32))
         offset = p - flat
         np.testing.assert_allclose(np.linalg.norm(offset, axis=1), 0.25, atol=1e-6)
@@ -142,18 +146,18 @@ def test_vertices_read_the_mip_level_of_their_spacing() -> None:
         np.float32
     )  # far finer than any edge: its mean is 0
     for level in (0, 1, 2):
-        tessellator = Tessellator(mesh, level, tangents=False)
-        fine = tessellator.topology.mesh
+        tessellator = Tessellator(mesh, level)
+        fine = tessellator.mesh
         assert 256 * np.sqrt(footprint(fine).min()) > 2  # texels per half edge
         p = posed(tessellator, mesh, finest)
         # without filtering a vertex may read up to 0.2; measured 4e-9
         assert np.linalg.norm(p - fine.positions, axis=1).max() < 1e-5
     # a map with no more detail than the tessellation can hold is read as it is
     broad = (0.2 * np.sin(2 * np.pi * x / 256)).astype(np.float32)
-    tessellator = Tessellator(mesh, 4, tangents=False)
+    tessellator = Tessellator(mesh, 4)
     codec, stored = relief_of(broad)
     read = np.array(tessellator.amount(codec.layer(stored)))
-    fine = tessellator.topology.mesh
+    fine = tessellator.mesh
     expected = np.bincount(
         fine.frame_vertex, share(fine) * 0.2 * np.sin(2 * np.pi * (fine.uvs[:, 0] - 0.5 / 256))
     )
@@ -168,10 +172,11 @@ def test_vertices_read_the_mip_level_of_their_spacing() -> None:
 def test_derivatives_of_the_displaced_surface(level: int, of: str) -> None:
     """Positions, normals and tangent bases of the displaced mesh by base vertices and by texels."""
     mesh = ball(48)
-    tessellator = Tessellator(mesh, level, tangents=True)
+    tessellator = Tessellator(mesh, level)
+    topology = LatentTopology(tessellator.mesh, tangents=True)
     codec, stored = relief_of(smooth())
     rng = np.random.default_rng(level)
-    fine = tessellator.topology.mesh
+    fine = tessellator.mesh
     weights = [
         rng.normal(size=8 * n).astype(np.float32) for n in (len(fine.positions), len(fine.uvs))
     ]
@@ -181,7 +186,7 @@ def test_derivatives_of_the_displaced_surface(level: int, of: str) -> None:
     }
 
     def buffers(p: mi.Float, layer) -> tuple[mi.Float, mi.Float]:
-        surface = tessellator.topology.surface(tessellator(p, layer))
+        surface = topology.surface(tessellator(p, layer))
         return surface.vertices, surface.frames
 
     p, layer = mi.Float(start[POSITIONS]), codec.layer(stored)
@@ -220,7 +225,7 @@ def inside_view(count: int = 2):
 
 def inside_model(
     fit: tuple[str, ...], level: int = 2, levels: tuple[int, ...] | None = None
-) -> Model:
+) -> Latent:
     mesh = sphere(192, (0.0, 0.0, 0.0), 1.0, SIZE)
     flat = np.zeros((SIZE, SIZE), np.float32)
     # maps that jump across a seam would move a step in the image with it, which no derivative of
@@ -236,7 +241,7 @@ def inside_model(
         normal_z=flat + 1,
         displacement=smooth(SIZE, 0.02) * fade,
     )
-    return Model(mesh, maps, frozenset(fit), Rates(), levels or (level,))
+    return latent_of(mesh, maps, frozenset(fit), Rates(), levels or (level,))
 
 
 @pytest.mark.parametrize("of", [POSITIONS, DISPLACEMENT, TEXELS])
@@ -273,7 +278,7 @@ def test_derivatives_of_the_image(of: str) -> None:
         assert abs(predicted - numeric) < 2e-4 * np.linalg.norm(slope) * np.linalg.norm(direction)
 
 
-def broad_direction(of: str, model: Model, seed: int) -> np.ndarray:
+def broad_direction(of: str, model: Latent, seed: int) -> np.ndarray:
     rng = np.random.default_rng(seed)
     if of == POSITIONS:
         p = model.mesh.positions.astype(np.float64)
@@ -287,7 +292,8 @@ def broad_direction(of: str, model: Model, seed: int) -> np.ndarray:
     ]
     if of == DISPLACEMENT:
         return (0.3 * waves[0]).astype(np.float32).ravel()
-    assert model.codec is not None
-    out = np.zeros((SIZE, SIZE, model.codec.packed), np.float32)
+    texels = model.fitted(Texels)
+    assert texels is not None
+    out = np.zeros((SIZE, SIZE, texels.codec.packed), np.float32)
     out[..., :3] = np.stack(waves, axis=-1)
     return out.ravel()

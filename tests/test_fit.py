@@ -18,12 +18,16 @@ from appearance_opt.errors import DivergedError, InputError, ReferenceRenderErro
 from appearance_opt.fit import loop
 from appearance_opt.fit.checkpoint import Checkpointer, FitState
 from appearance_opt.fit.loop import FitOptions, fit
-from appearance_opt.fit.model import POSITIONS, TEXELS, Model, Rates
 from appearance_opt.fit.schedule import laplacian_weight
 from appearance_opt.fit.step import Gradients, StepInputs
 from appearance_opt.fit.validation import Validation
 from appearance_opt.initial.sphere import random_maps, sphere
 from appearance_opt.jobs.simplify import simplify
+from appearance_opt.latent.build import latent_of
+from appearance_opt.latent.latent import Latent
+from appearance_opt.latent.parameter import Rates
+from appearance_opt.latent.positions import POSITIONS
+from appearance_opt.latent.texels import TEXELS, Texels
 from appearance_opt.reference.mesh import MeshReference
 from appearance_opt.reference.pool import ReferencePool
 from appearance_opt.render.quality import Quality
@@ -52,7 +56,7 @@ def make_fit(
 ):
     reference = MeshReference(ball)
     mesh = sphere(300, (0.0, 0.0, 0.0), 0.9, size)
-    model = Model(
+    model = latent_of(
         mesh, random_maps(size, 0, True), frozenset(fitted), Rates(0.02, 0.01, 0.03, 0.02)
     )
     pool = ReferencePool(reference, SAMPLER, 16, 2, 48, 4)
@@ -77,8 +81,9 @@ def test_a_fit_finds_a_painted_ball(ball: Asset) -> None:
 def test_what_is_not_fitted_does_not_exist(ball: Asset) -> None:
     model, _, _ = make_fit(ball, ("normal",))
     assert set(model.parameters) == {TEXELS}
-    assert model.codec is not None
-    assert model.codec.channels == ("normal_x", "normal_y", "normal_z")
+    texels = model.fitted(Texels)
+    assert texels is not None
+    assert texels.channels == ("normal_x", "normal_y", "normal_z")
     shape_only, pool, validation = make_fit(ball, ("shape",))
     assert set(shape_only.parameters) == {POSITIONS}
     before = shape_only.host_maps()
@@ -195,13 +200,13 @@ def test_an_interrupted_look_leaves_the_parameters(
     class Keep(Checkpointer):
         def __init__(self) -> None: ...
 
-        def restore(self, model: Model, state: FitState) -> bool:
+        def restore(self, model: Latent, state: FitState) -> bool:
             return False
 
         def due(self) -> bool:
             return False
 
-        def save(self, model: Model, state: FitState) -> None:
+        def save(self, model: Latent, state: FitState) -> None:
             kept.append(
                 {
                     n: (np.array(v), np.array(state.moments[n].mean))
@@ -212,7 +217,7 @@ def test_an_interrupted_look_leaves_the_parameters(
     looks = iter([None, KeyboardInterrupt, None])
     whole = Validation.psnr
 
-    def psnr(self: Validation, model: Model) -> float:
+    def psnr(self: Validation, model: Latent) -> float:
         what = next(looks)
         if what is not None:
             raise what

@@ -8,10 +8,11 @@ import pytest
 
 from appearance_opt.asset.types import Asset
 from appearance_opt.fit.loop import FitOptions, FitResult, fit
-from appearance_opt.fit.model import Model, Rates
 from appearance_opt.fit.validation import Validation
 from appearance_opt.initial.sphere import random_maps, sphere
+from appearance_opt.latent.build import latent_of
 from appearance_opt.latent.folds import Folds
+from appearance_opt.latent.parameter import Rates
 from appearance_opt.reference.mesh import MeshReference
 from appearance_opt.reference.pool import ReferencePool
 from appearance_opt.views import ViewSampler
@@ -94,7 +95,7 @@ def fitted(ball: Asset, relative: bool) -> tuple[FitResult, int]:
     sampler = ViewSampler((0.0, 0.0, 0.0), 1.0, seed=1)
     reference = MeshReference(ball)
     mesh = sphere(1200, (0.0, 0.0, 0.0), 0.95, 64)
-    model = Model(
+    model = latent_of(
         mesh,
         random_maps(64, 0, True),
         frozenset(("shape", "normal", "material")),

@@ -13,14 +13,16 @@ from appearance_opt.asset.normals import vertex_normals
 from appearance_opt.asset.tangents import split_and_tangents
 from appearance_opt.backend import to_device
 from appearance_opt.fit import adam
-from appearance_opt.fit.loop import laplacians
 from appearance_opt.fit.losses import LOSSES, Target, compared_pixels, image_loss
-from appearance_opt.fit.model import POSITIONS, TEXELS, Model, Rates
 from appearance_opt.fit.step import Gradients, StepInputs, first_non_finite, step
 from appearance_opt.initial.sphere import sphere
+from appearance_opt.latent.build import latent_of
 from appearance_opt.latent.laplacian import Laplacian
+from appearance_opt.latent.latent import Latent
 from appearance_opt.latent.mesh import LatentMesh, LatentTopology, local_edge_length
-from appearance_opt.latent.texels import TexelCodec
+from appearance_opt.latent.parameter import Rates
+from appearance_opt.latent.positions import POSITIONS
+from appearance_opt.latent.texels import TEXELS, TexelCodec, Texels
 from appearance_opt.reference.pool import Targets
 from appearance_opt.render import gradient
 from appearance_opt.render.images import render_image
@@ -56,12 +58,12 @@ def wavy_maps(size: int) -> dict[str, np.ndarray]:
 
 def make_model(
     triangles: int = 300, size: int = 32, fit: tuple[str, ...] = ("shape", "normal", "material")
-) -> Model:
+) -> Latent:
     mesh = sphere(triangles, (0.0, 0.0, 0.0), 0.7, size)
-    return Model(mesh, wavy_maps(size), frozenset(fit), Rates())
+    return latent_of(mesh, wavy_maps(size), frozenset(fit), Rates())
 
 
-def make_inputs(model: Model, grid: Grid, seed: int = 0) -> StepInputs:
+def make_inputs(model: Latent, grid: Grid, seed: int = 0) -> StepInputs:
     views = SAMPLER.draw(seed, grid.views)
     reference = to_device(np.random.default_rng(seed).random(grid.pixels * 4) * 0.5)
     return StepInputs(
@@ -99,7 +101,9 @@ def test_texel_gradients_agree_with_finite_differences() -> None:
 def test_each_channel_has_its_own_correct_gradient(channel: str) -> None:
     model, grid, quality = make_model(), Grid(2, 48), Quality(0.0, 1, 1)
     loss = LOSSES["log-srgb-l2"]
-    codec, parameter = model.codec, model.parameters[TEXELS]
+    texels, parameter = model.fitted(Texels), model.parameters[TEXELS]
+    assert texels is not None
+    codec = texels.codec
     assert codec is not None
     index = codec.channels.index(channel)
     start = np.array(parameter.value).reshape(-1, codec.packed)
@@ -130,10 +134,10 @@ def test_each_channel_has_its_own_correct_gradient(channel: str) -> None:
 def coverage_derivative(density: float, samples: int) -> tuple[float, float]:
     """(by the edge term, by finite differences) of the covered area under a scaling of a sphere."""
     mesh = sphere(1200, (0.0, 0.0, 0.0), 0.7, 16)
-    model = Model(mesh, flat_maps(16), frozenset(("shape",)), Rates())
+    model = latent_of(mesh, flat_maps(16), frozenset(("shape",)), Rates())
     grid = Grid(4, 64)
     records = SAMPLER.draw(1, 4).records()
-    start = np.array(model.positions())
+    start = np.array(model.vertices())
     positions = mi.Float(start)
     dr.enable_grad(positions)
     drawn, batch = drawn_of(model, positions), Batch(records, grid)
@@ -301,7 +305,7 @@ def test_a_mesh_out_of_sight_has_no_gradient_and_breaks_nothing() -> None:
     away = LatentMesh(
         mesh.positions + np.float32(100), mesh.faces, mesh.frame_vertex, mesh.frame_faces, mesh.uvs
     )
-    model = Model(away, flat_maps(16), frozenset(("shape", "normal", "material")), Rates())
+    model = latent_of(away, flat_maps(16), frozenset(("shape", "normal", "material")), Rates())
     grid = Grid(2, 32)
     value, grads = Gradients(model, grid, Quality(), LOSSES["log-srgb-l1"], freeze=False)(
         make_inputs(model, grid)
@@ -325,17 +329,15 @@ def test_pixels_shaded_with_their_loss_have_the_gradient_of_the_whole_image(
     inputs = replace(make_inputs(model, grid, 1), want_loss=want_loss)
     loss = LOSSES["log-srgb-l1"]
     value, quick = Gradients(model, grid, quality, loss, freeze=False)(inputs)
-    layer = model.fitted_layer()
-    assert layer is not None and model.codec is not None
-    shape, layer = model.track(model.shape(), layer)
-    drawn = replace(drawn_of(model, model.drawn.pose(shape)), maps=model.maps(layer))
+    tracked = model.track(model.decode(model.values()))
+    drawn = model.drawn(tracked)
     rendered = gradient.render(drawn, Batch(inputs.views.records(), grid), quality, inputs.seed)
     assert rendered.deferred is None
     target = Target.of(inputs.reference.average, inputs.background)
     pixels = compared_pixels(rendered.image, target)
     whole, by_image = image_loss(loss, target, rendered.image, pixels, grid.pixels)
     gradient.backward(gradient.surrogate(rendered, drawn, by_image))
-    slow = model.gradients(shape, layer, model.values())
+    slow = model.gradients(tracked, model.values())
     assert (value is not None) == want_loss
     if value is not None:
         assert float(value[0]) == pytest.approx(np.array(whole).sum(), rel=1e-5)
@@ -356,16 +358,18 @@ def test_frozen_steps_equal_traced_ones(levels: tuple[int, ...], visibility: str
     if levels != (0,):
         maps["displacement"] = np.full((16, 16), 0.02, np.float32)
         parts.append("displacement")
-    model = Model(sphere(300, (0.0, 0.0, 0.0), 0.7, 32), maps, frozenset(parts), Rates(), levels)
+    model = latent_of(
+        sphere(300, (0.0, 0.0, 0.0), 0.7, 32), maps, frozenset(parts), Rates(), levels
+    )
     grid, loss = Grid(2, 48), LOSSES["log-srgb-l1"]
-    regularizers = laplacians(model, relative=False)
+    regularizers = model.laplacians(relative=False)
     quality = Quality(visibility=visibility)
     frozen, plain = (
         Gradients(model, grid, quality, loss, regularizers, freeze=f) for f in (True, False)
     )
     moments = {n: adam.moments_of(p) for n, p in model.parameters.items()}
     for k in range(8):
-        model.select(levels[k % len(levels)])
+        model.select(model.poses[k % len(levels)])
         inputs = replace(
             make_inputs(model, grid, k), laplacian_weight=0.1 * k, rate=1.0, want_loss=k % 3 == 0
         )

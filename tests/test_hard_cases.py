@@ -11,11 +11,15 @@ import pytest
 
 from appearance_opt.asset.types import Asset, Material, Mesh, Texture
 from appearance_opt.fit.losses import LOSSES
-from appearance_opt.fit.model import POSITIONS, TEXELS, Model, Rates
 from appearance_opt.fit.step import Gradients, StepInputs
 from appearance_opt.initial.sphere import sphere
+from appearance_opt.latent.build import latent_of
 from appearance_opt.latent.export import to_asset
+from appearance_opt.latent.latent import Latent
 from appearance_opt.latent.mesh import LatentMesh
+from appearance_opt.latent.parameter import Rates
+from appearance_opt.latent.positions import POSITIONS
+from appearance_opt.latent.texels import TEXELS
 from appearance_opt.reference.mesh import MeshReference
 from appearance_opt.reference.pool import Targets
 from appearance_opt.render.images import render_image
@@ -42,9 +46,9 @@ def latent(positions: object, faces: object, uvs: object = None) -> LatentMesh:
     return LatentMesh(p, f, f.ravel(), frames, np.asarray(corners, np.float32).reshape(-1, 2))
 
 
-def model_of(mesh: LatentMesh, size: int = 16, **values: float) -> Model:
+def model_of(mesh: LatentMesh, size: int = 16, **values: float) -> Latent:
     maps = {k: np.full((size, size), v, np.float32) for k, v in {**CHANNELS, **values}.items()}
-    return Model(mesh, maps, frozenset(["shape", "normal", "material"]), Rates())
+    return latent_of(mesh, maps, frozenset(["shape", "normal", "material"]), Rates())
 
 
 def front(
@@ -58,7 +62,7 @@ EDGES, PAIRS = Quality(2.0, 4, 1), Quality(visibility="pairs")
 
 
 def check(
-    mesh: LatentMesh | Model,
+    mesh: LatentMesh | Latent,
     views: Views,
     resolution: int = 24,
     loss: str = "log-srgb-l1",
@@ -67,7 +71,7 @@ def check(
 ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """Image (H, W, 4) of the first view and gradients by name, all finite; ``values``: of the
     maps."""
-    model = mesh if isinstance(mesh, Model) else model_of(mesh, **values)
+    model = mesh if isinstance(mesh, Latent) else model_of(mesh, **values)
     grid = Grid(len(views), resolution)
     target = np.zeros((grid.pixels, 4), np.float32)
     target[: grid.pixels // 2] = (0.2, 0.3, 0.4, 1.0)

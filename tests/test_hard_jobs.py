@@ -16,11 +16,12 @@ from appearance_opt.evaluate.metrics import compare_images
 from appearance_opt.fit import loop
 from appearance_opt.fit.checkpoint import Checkpointer
 from appearance_opt.fit.loop import FitOptions, FitResult, fit
-from appearance_opt.fit.model import Model, Rates
 from appearance_opt.fit.validation import Validation
 from appearance_opt.initial.sphere import sphere
 from appearance_opt.jobs.simplify import simplify
+from appearance_opt.latent.latent import Latent
 from appearance_opt.latent.mesh import LatentMesh
+from appearance_opt.latent.parameter import Rates
 from appearance_opt.reference.mesh import MeshReference
 from appearance_opt.reference.pool import ReferencePool
 from appearance_opt.views import Views
@@ -141,7 +142,7 @@ class Images:
 
 def fit_of(
     reference: object, mesh: LatentMesh, steps: int, **choices: object
-) -> tuple[Model, FitResult]:
+) -> tuple[Latent, FitResult]:
     model = model_of(mesh)
     pool = ReferencePool(reference, SAMPLER, 8, 2, 32, 4)
     validation = Validation(reference, SAMPLER.held_out(1).draw(0, 2), 32)

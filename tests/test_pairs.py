@@ -12,10 +12,13 @@ import numpy as np
 import pytest
 
 from appearance_opt.fit.losses import LOSSES
-from appearance_opt.fit.model import POSITIONS, Model, Rates
 from appearance_opt.fit.step import Gradients
 from appearance_opt.initial.sphere import sphere
+from appearance_opt.latent.build import latent_of
+from appearance_opt.latent.latent import Latent
 from appearance_opt.latent.mesh import LatentMesh
+from appearance_opt.latent.parameter import Rates
+from appearance_opt.latent.positions import POSITIONS
 from appearance_opt.render import gradient, silhouette_walk
 from appearance_opt.render.drawn import Drawn
 from appearance_opt.render.edge_list import edge_list, walkable
@@ -36,8 +39,8 @@ SAMPLER = ViewSampler((0.0, 0.0, 0.0), 1.0, seed=5)
 PAIRS = Quality(visibility="pairs")
 
 
-def white(mesh: LatentMesh) -> Model:
-    return Model(mesh, flat_maps(16), frozenset(("shape",)), Rates())
+def white(mesh: LatentMesh) -> Latent:
+    return latent_of(mesh, flat_maps(16), frozenset(("shape",)), Rates())
 
 
 def two_balls() -> LatentMesh:
@@ -49,10 +52,10 @@ def two_balls() -> LatentMesh:
 
 
 def render(
-    model: Model, views: Views, grid: Grid, quality: Quality
+    model: Latent, views: Views, grid: Grid, quality: Quality
 ) -> tuple[RenderedBatch, Drawn, mi.Float]:
     """(rendered batch, what is drawn, positions that track gradients)."""
-    positions = mi.Float(np.array(model.positions()))
+    positions = mi.Float(np.array(model.vertices()))
     dr.enable_grad(positions)
     drawn = drawn_of(model, positions, walkable=True)
     return gradient.render(drawn, Batch(views.records(), grid), quality, 0), drawn, positions
@@ -68,7 +71,7 @@ def pulled(
 
 
 def differences(
-    model: Model,
+    model: Latent,
     start: np.ndarray,
     fields: np.ndarray,
     step: float,

@@ -12,9 +12,10 @@ import pytest
 import appearance_opt
 from appearance_opt.asset import save
 from appearance_opt.asset.types import Asset, Material, Mesh, srgb_to_linear
-from appearance_opt.fit.model import Model, Rates
+from appearance_opt.latent.build import latent_of
 from appearance_opt.latent.export import to_asset
 from appearance_opt.latent.mesh import LatentMesh
+from appearance_opt.latent.parameter import Rates
 from appearance_opt.reference.mesh import MeshReference
 from appearance_opt.stages.plain import LOSS, NOISE, STEP, Pictures, replace_constant
 from appearance_opt.views import views_around
@@ -242,7 +243,7 @@ def test_pictures_measure_what_changes() -> None:
     latent = LatentMesh(mesh.positions[used], faces, np.arange(len(used)), faces, uvs)
     grey = {**dict.fromkeys(COLORS, 0.4), "roughness": 0.6, "metalness": 0.0}
     maps = {n: np.full((16, 16), v, np.float32) for n, v in grey.items()}
-    model = Model(latent, maps, frozenset({"material"}), Rates())
+    model = latent_of(latent, maps, frozenset({"material"}), Rates())
     judge = Pictures(model, reference, views_around(mesh.positions, 0), 32)
     assert judge.change(maps) == 0 and judge.loss(maps) == 0
     assert 0 < judge.change({**maps, "roughness": 0.6 + STEP / 4}) < STEP

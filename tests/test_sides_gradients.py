@@ -14,10 +14,12 @@ from test_gradients import flat_maps, make_inputs
 from test_sides import joined, sheet
 
 from appearance_opt.fit.losses import LOSSES
-from appearance_opt.fit.model import POSITIONS, Model, Rates
 from appearance_opt.fit.step import Gradients
 from appearance_opt.initial.sphere import sphere
+from appearance_opt.latent.build import latent_of
 from appearance_opt.latent.mesh import LatentMesh
+from appearance_opt.latent.parameter import Rates
+from appearance_opt.latent.positions import POSITIONS
 from appearance_opt.render import gradient
 from appearance_opt.render.images import render_image
 from appearance_opt.render.pixels import Batch, Grid
@@ -62,13 +64,13 @@ def test_silhouettes_carry_the_derivative_of_the_area_that_is_seen_of_fronts(
 ) -> None:
     """Seen from both sides; each vertex has a direction of its own, and each view a weight."""
     mesh, views, grid = make(), SAMPLER.draw(1, 8), Grid(8, 64)
-    model = Model(mesh, flat_maps(16), frozenset(("shape",)), Rates())
+    model = latent_of(mesh, flat_maps(16), frozenset(("shape",)), Rates())
     assert model.topology.culled is not None and model.topology.culled.all()
     quality = (
         Quality(4.0, 8, 1) if visibility == "edges" else Quality(visibility="pairs", samples=4)
     )
     weight = np.repeat(np.random.default_rng(0).uniform(0.5, 1.5, 8), 64 * 64)
-    start = np.array(model.positions())
+    start = np.array(model.vertices())
     positions = mi.Float(start)
     dr.enable_grad(positions)
     drawn, batch = drawn_of(model, positions, quality.walks), Batch(views.records(), grid)
@@ -103,12 +105,12 @@ def test_frozen_steps_see_backs_turn() -> None:
     """Recorded kernels see sheets that move and turn over."""
     mesh = back_to_back()
     model, grid, quality = (
-        Model(mesh, flat_maps(16), frozenset(("shape",)), Rates()),
+        latent_of(mesh, flat_maps(16), frozenset(("shape",)), Rates()),
         Grid(2, 32),
         Quality(),
     )
     frozen, plain = (Gradients(model, grid, quality, LOSSES["l2"], freeze=f) for f in (True, False))
-    start = np.array(model.positions()).reshape(-1, 3)
+    start = np.array(model.vertices()).reshape(-1, 3)
     for k in range(5):
         model.parameters[POSITIONS].value = mi.Float(
             (start * (1, -1)[k % 2] * (1 - 0.05 * k)).ravel()

@@ -14,9 +14,11 @@ from appearance_opt.asset import Asset, Material, Mesh, Texture, load, save
 from appearance_opt.asset.types import srgb_to_linear
 from appearance_opt.config import bake_options, simplify_options, with_values
 from appearance_opt.fit.losses import LOSSES
-from appearance_opt.fit.model import TEXELS, Model, Rates
 from appearance_opt.fit.step import Gradients
 from appearance_opt.jobs.inspect import inspect
+from appearance_opt.latent.build import latent_of
+from appearance_opt.latent.parameter import Rates
+from appearance_opt.latent.texels import TEXELS
 from appearance_opt.reference.mesh import MeshReference
 from appearance_opt.render.material import UNLIT
 from appearance_opt.render.pixels import Grid
@@ -93,7 +95,7 @@ def test_gradients_of_unlit_texels_agree_with_finite_differences() -> None:
         np.float32
     ).repeat(size, axis=0)
     maps = {"red": wave, "green": 1 - wave, "blue": wave.T.copy(), UNLIT: 1.0}
-    model = Model(mesh, maps, frozenset({"material"}), Rates())
+    model = latent_of(mesh, maps, frozenset({"material"}), Rates())
     grid, quality, loss = Grid(2, 48), Quality(0.0, 1, 1), LOSSES["l2"]
     inputs = make_inputs(model, grid)
     _, grads = Gradients(model, grid, quality, loss, freeze=False)(inputs)

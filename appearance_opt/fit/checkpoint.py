@@ -21,7 +21,7 @@ from appearance_opt.lock import FOLDER_LOCK
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from appearance_opt.fit.model import Model
+    from appearance_opt.latent.latent import Latent
 
 log = logging.getLogger(__name__)
 
@@ -30,7 +30,7 @@ T = TypeVar("T")
 
 @dataclass
 class FitState:
-    """Everything that a fit changes, but the model's parameters."""
+    """Everything that a fit changes, but the parameters."""
 
     moments: dict[str, Moments]
     iteration: int = 0
@@ -132,11 +132,13 @@ class Checkpointer:
         """Is it time for another checkpoint?"""
         return time.monotonic() - self._last >= self.interval
 
-    def save(self, model: Model, state: FitState) -> None:
+    def save(self, latent: Latent, state: FitState) -> None:
         """Write the state; see ``archive.write``. Where it cannot be written, the fit is worth more
         than its checkpoint: this is said once, and the one before stays."""
         try:
-            archive.write(self.path, self.fingerprint, Kept(self.start_hash, model.values(), state))
+            archive.write(
+                self.path, self.fingerprint, Kept(self.start_hash, latent.values(), state)
+            )
         except OSError as error:
             if not self._failed:
                 log.warning(
@@ -145,8 +147,8 @@ class Checkpointer:
             self._failed = True
         self._last = time.monotonic()
 
-    def restore(self, model: Model, state: FitState) -> bool:
-        """Bring model and state to the checkpoint, if one is to be resumed and exists. Raises
+    def restore(self, latent: Latent, state: FitState) -> bool:
+        """Bring latent and state to the checkpoint, if one is to be resumed and exists. Raises
         InputError when it is damaged or belongs to another job or another start."""
         if not self.resume:
             return False
@@ -155,7 +157,7 @@ class Checkpointer:
             return False
         try:
             kept = archive.read(self.path, self.fingerprint, (Kept, FitState, Moments), mi.Float)
-            _check(kept, model)
+            _check(kept, latent)
         except archive.DamagedError as error:
             raise InputError(
                 f"{self.path}: not a usable checkpoint ({error}); empty the folder to start anew"
@@ -166,7 +168,7 @@ class Checkpointer:
                 "empty the folder to start anew"
             )
         vars(state).update(vars(kept.state))
-        model.restore(kept.values)
+        latent.restore(kept.values)
         return True
 
 
@@ -175,16 +177,16 @@ def _temporary(path: Path) -> bool:
     return path.suffix == archive.TEMPORARY and path.name.startswith((".fit-", ".start-"))
 
 
-def _check(kept: Kept, model: Model) -> None:
-    """Raise DamagedError if there are not as many numbers as the model has."""
+def _check(kept: Kept, latent: Latent) -> None:
+    """Raise DamagedError if there are not as many numbers as the latent has."""
     if not isinstance(kept, Kept) or not isinstance(kept.state, FitState):
         raise archive.DamagedError("it holds no state of a fit")
-    for name, parameter in model.parameters.items():
+    for name, parameter in latent.parameters.items():
         wanted, moments = dr.width(parameter.value), kept.state.moments.get(name)
         if (
             name not in kept.values
             or moments is None
-            or name not in (kept.state.best or model.parameters)
+            or name not in (kept.state.best or latent.parameters)
         ):
             raise archive.DamagedError(f"it holds no {name}")
         rows = [kept.values[name], moments.first, moments.second, moments.mean]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Protocol, TypeVar
 
 import numpy as np
 
@@ -13,24 +13,23 @@ from appearance_opt.errors import DivergedError
 from appearance_opt.fit import adam
 from appearance_opt.fit.checkpoint import Checkpointer, FitState
 from appearance_opt.fit.losses import loss_of_name
-from appearance_opt.fit.model import POSITIONS, Model
 from appearance_opt.fit.schedule import Clock, laplacian_weight, learning_rate
 from appearance_opt.fit.step import Gradients, StepInputs, StepResult, first_non_finite, step
 from appearance_opt.fit.validation import Validation
-from appearance_opt.latent.displacement import DISPLACEMENT
-from appearance_opt.latent.folds import Folds
-from appearance_opt.latent.laplacian import Laplacian
-from appearance_opt.latent.mesh import local_edge_length
 from appearance_opt.render.display import BACKGROUND as GREY
 from appearance_opt.render.pixels import Grid
 from appearance_opt.render.quality import Quality
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
 
     from numpy.typing import NDArray
 
+    from appearance_opt.latent.latent import Latent
+    from appearance_opt.latent.parts import Guard
     from appearance_opt.reference.pool import ReferencePool
+
+T = TypeVar("T")
 
 log = logging.getLogger(__name__)
 
@@ -131,7 +130,7 @@ class Progress(Protocol):
 
 
 def fit(
-    model: Model,
+    latent: Latent,
     pool: ReferencePool,
     validation: Validation,
     options: FitOptions,
@@ -142,7 +141,7 @@ def fit(
     """Fit the model to the pool's reference. ``stop``: asked before every step whether the fit
     shall end early. A KeyboardInterrupt ends it in the same way. Raises DivergedError (the model
     then holds the best state)."""
-    run = _Run(model, pool, validation, options, progress, checkpointer)
+    run = _Run(latent, pool, validation, options, progress, checkpointer)
     try:
         if run.state.best is None:
             run.look()
@@ -153,7 +152,7 @@ def fit(
     except KeyboardInterrupt:
         log.warning("interrupted at step %d: the best state so far is kept", run.state.iteration)
         run.result.interrupted = True
-        model.update_scene()  # the step that was interrupted may have moved the parameters, but not yet the mesh
+        latent.update_scene()  # the step that was interrupted may have moved the parameters, but not yet the mesh
     except DivergedError:
         run.finish(look=False)
         raise
@@ -166,30 +165,26 @@ class _Run:
 
     def __init__(
         self,
-        model: Model,
+        latent: Latent,
         pool: ReferencePool,
         validation: Validation,
         options: FitOptions,
         progress: Progress | None,
         checkpointer: Checkpointer | None,
     ) -> None:
-        self.model, self.pool, self.validation, self.options = model, pool, validation, options
+        self.latent, self.pool, self.validation, self.options = latent, pool, validation, options
         self.progress, self.checkpointer = progress, checkpointer
         self.loss = loss_of_name(options.loss)
         self.grid = Grid(pool.batch, pool.resolution)
         # points can only be compared if both sides filter alike
         self.quality = replace(options.quality, point_width=pool.point_width)
         self.result = FitResult()
-        self.state = FitState(moments={n: adam.moments_of(p) for n, p in model.parameters.items()})
-        self.laplacians: dict[int, Laplacian] = {}
-        if {POSITIONS, DISPLACEMENT} & set(model.parameters) and options.laplacian > 0:
-            self.laplacians = laplacians(model, options.relative)
-        self.folds: Folds | None = None
-        if POSITIONS in model.parameters and options.relative:
-            self.folds = Folds(model.mesh.positions, model.mesh.faces)
-        if checkpointer is not None and checkpointer.restore(model, self.state):
+        self.state = FitState(moments={n: adam.moments_of(p) for n, p in latent.parameters.items()})
+        self.laplacians = latent.laplacians(options.relative) if options.laplacian > 0 else {}
+        self.guards: dict[str, Guard] = latent.guards() if options.relative else {}
+        if checkpointer is not None and checkpointer.restore(latent, self.state):
             self.result.curve = [CurvePoint(*p) for p in self.state.curve]
-        self.gradients = Gradients(model, self.grid, self.quality, self.loss, self.laplacians)
+        self.gradients = Gradients(latent, self.grid, self.quality, self.loss, self.laplacians)
         self.clock = Clock(options.steps, options.seconds, self.state.seconds)
         self.bad_steps = 0
         self.psnr = self.state.best_psnr
@@ -202,7 +197,7 @@ class _Run:
         state, options = self.state, self.options
         fraction = self.clock.progress(state.iteration)
         views, reference = self.pool.draw(state.iteration)
-        self.model.select(level_of(self.model.levels, options.seed, state.iteration))
+        self.latent.select(pose_of(self.latent.poses, options.seed, state.iteration))
         inputs = StepInputs(
             views=views,
             reference=reference,
@@ -217,7 +212,7 @@ class _Run:
         self._count(done.bad)
         if done.bad is None and done.loss is not None:
             state.loss = done.loss
-            if state.laplacian == 0 and self.model.level in self.laplacians:
+            if state.laplacian == 0 and self.latent.pose.level in self.laplacians:
                 # a deviation of a tenth of an edge length costs this fraction of the first image
                 # loss
                 state.laplacian = options.laplacian * done.loss / 0.01
@@ -243,13 +238,13 @@ class _Run:
         """Render the held-out views; remember the state if it is the best so far."""
         state = self.state
         unfolded = self._unfold()
-        current = self.model.values()
+        current = self.latent.values()
         means = {name: moments.mean for name, moments in state.moments.items()}
         try:
-            self.model.restore(means)
-            self.psnr = self.validation.psnr(self.model)
+            self.latent.restore(means)
+            self.psnr = self.validation.psnr(self.latent)
         finally:  # an interrupted look must not leave the means where a checkpoint takes them for the parameters
-            self.model.restore(current)
+            self.latent.restore(current)
         point = CurvePoint(self.clock.time(), state.iteration, self.psnr, state.loss)
         if not self.result.curve or self.result.curve[-1].step != state.iteration:
             self.result.curve.append(point)
@@ -260,13 +255,15 @@ class _Run:
     def _unfold(self) -> int:
         """Turn folded triangles back, of the means and of where the next step starts. How many the
         means had."""
-        if self.folds is None or self.state.best is None:
-            return 0
-        parameter, moments = self.model.parameters[POSITIONS], self.state.moments[POSITIONS]
-        safe = self.state.best[POSITIONS]
-        moments.mean, count = self.folds.undo(moments.mean, safe)
-        parameter.value, _ = self.folds.undo(parameter.value, safe)
-        return count
+        total = 0
+        for name, guard in self.guards.items() if self.state.best is not None else ():
+            assert self.state.best is not None
+            parameter, moments = self.latent.parameters[name], self.state.moments[name]
+            safe = self.state.best[name]
+            moments.mean, count = guard.undo(moments.mean, safe)
+            parameter.value, _ = guard.undo(parameter.value, safe)
+            total += count
+        return total
 
     def finish(self, look: bool) -> None:
         """A last look, then back to the best state."""
@@ -275,7 +272,7 @@ class _Run:
         if self.checkpointer is not None:
             self.save()
         if self.state.best is not None:
-            self.model.restore(self.state.best)
+            self.latent.restore(self.state.best)
         self.result.steps = self.state.iteration
         self.result.best_step = self.state.best_iteration
         self.result.unfolded = self.state.unfolded
@@ -287,17 +284,16 @@ class _Run:
         self.state.seconds = self.clock.time()
         self.state.curve = [(p.seconds, p.step, p.psnr, p.loss) for p in self.result.curve]
         if self.checkpointer is not None:
-            self.checkpointer.save(self.model, self.state)
+            self.checkpointer.save(self.latent, self.state)
 
     def _commit(self, done: StepResult) -> None:
         """Take the step, or only count it if its gradient was bad. Values, moments and iteration
         change together, before anything slow."""
-        for name, value in done.values.items():
-            self.model.parameters[name].value = value
+        self.latent.assign(done.values)
         self.state.moments.update(done.moments)
         self.state.iteration += 1
         if done.values:
-            self.model.update_scene()
+            self.latent.update_scene()
 
     def _count(self, bad: str | None) -> None:
         if bad is None:
@@ -336,23 +332,11 @@ def seed_of(seed: int, iteration: int) -> int:
     return int(np.random.default_rng([seed, 17, iteration]).integers(2**32))
 
 
-def level_of(levels: tuple[int, ...], seed: int, iteration: int) -> int:
-    """The tessellation level of an iteration: drawn at random, the same whenever it is replayed."""
-    if len(levels) == 1:
-        return levels[0]
-    return levels[int(np.random.default_rng([seed, 13, iteration]).integers(len(levels)))]
-
-
-def laplacians(model: Model, relative: bool) -> dict[int, Laplacian]:
-    """The regularizer of each tessellation level, on the displaced mesh, relative to it as it is
-    now."""
-    out = {}
-    for level in model.levels:
-        mesh, positions = model.host_drawn(level)
-        out[level] = Laplacian(
-            positions, mesh.faces, local_edge_length(positions, mesh.faces), relative
-        )
-    return out
+def pose_of(poses: Sequence[T], seed: int, iteration: int) -> T:
+    """The pose of an iteration: drawn at random, the same whenever it is replayed."""
+    if len(poses) == 1:
+        return poses[0]
+    return poses[int(np.random.default_rng([seed, 13, iteration]).integers(len(poses)))]
 
 
 def backgrounds(

@@ -20,11 +20,11 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
     from appearance_opt.fit.losses import Loss
-    from appearance_opt.fit.model import Model, Shape
     from appearance_opt.latent.laplacian import Laplacian
+    from appearance_opt.latent.latent import Decoded, Latent, Values
+    from appearance_opt.latent.parts import Pose
     from appearance_opt.reference.pool import Targets
     from appearance_opt.render.freezing import Run
-    from appearance_opt.render.material import TexelLayer
     from appearance_opt.render.pixels import Grid
     from appearance_opt.render.quality import Quality
     from appearance_opt.render.surface import Surface
@@ -59,7 +59,7 @@ class StepResult:
 
 
 class Gradients:
-    """The gradients of a model, as a function of the views and images of a step.
+    """The gradients of a latent, as a function of the views and images of a step.
 
     ``laplacians``: the regularizer of each tessellation level, if any. ``freeze``: record the
     kernels of the first steps and launch them again without tracing (see ``render.freezing``);
@@ -68,33 +68,30 @@ class Gradients:
 
     def __init__(
         self,
-        model: Model,
+        latent: Latent,
         grid: Grid,
         quality: Quality,
         loss: Loss,
         laplacians: Mapping[int, Laplacian] | None = None,
         freeze: bool = True,
     ) -> None:
-        self.model, self.grid, self.quality, self.loss = model, grid, quality, loss
+        self.latent, self.grid, self.quality, self.loss = latent, grid, quality, loss
         self.laplacians = laplacians or {}
-        self._edges = {
-            level: t.walkable if quality.walks else t.edges
-            for level, t in model.topologies().items()
-        }
+        self._edges = {p.level: latent.edges(p, quality.walks) for p in latent.poses}
         self._run: Run = (
-            Frozen(model.fixed(), self.laplacians, grid, self._edges) if freeze else traced
+            Frozen(latent.fixed(), self.laplacians, grid, self._edges) if freeze else traced
         )
 
-    def __call__(self, inputs: StepInputs) -> tuple[mi.Float | None, dict[str, mi.Float]]:
+    def __call__(self, inputs: StepInputs) -> tuple[mi.Float | None, Values]:
         """Mean image loss (width 1; None without ``want_loss``) and the gradient of every
         parameter."""
-        model, grid, run = self.model, self.grid, self._run
+        latent, grid, run, pose = self.latent, self.grid, self._run, self.latent.pose
         target = Target.of(inputs.reference.average, inputs.background)
-        stored = model.values()
+        stored = latent.values()
         with dr.suspend_grad():
-            shape, layer = run(self._unpacked, stored)
-            surface = run(self._surface, model.level, shape)
-        drawn = Drawn(model.scene, surface, model.maps(layer), self._edges[model.level])
+            decoded = run(latent.decode, stored)
+            surface = run(self._surface, pose, decoded)
+        drawn = latent.drawn(decoded, surface, self.quality.walks)
         batch = Batch(inputs.views.records(), grid)
         rendered = gradient.render(drawn, batch, self.quality, inputs.seed, run, defer=True)
         # Only averaged pixels have a gradient here. Of one ray per pixel these are the crossed
@@ -112,10 +109,9 @@ class Gradients:
         points = inputs.reference.points if self.quality.samples == 1 else None
         direct, out = run(
             self._pulled_back,
-            model.level,
+            pose,
             stored,
-            shape,
-            layer,
+            decoded,
             drawn,
             rendered,
             by_image,
@@ -133,33 +129,28 @@ class Gradients:
         """Recordings made so far; 0 when nothing is frozen."""
         return self._run.recordings() if isinstance(self._run, Frozen) else 0
 
-    def _unpacked(self, stored: dict[str, mi.Float]) -> tuple[Shape, TexelLayer | None]:
-        return self.model.shape_of(stored), self.model.layer_of(stored)
-
-    def _surface(self, level: int, shape: Shape) -> Surface:
-        """The surface, without gradients. ``level``: the one that the model draws; each has
-        recordings of its own."""
-        return self.model.surface(self.model.drawn.pose(shape))
+    def _surface(self, pose: Pose, decoded: Decoded) -> Surface:
+        """The surface, without gradients."""
+        return self.latent.surface(self.latent.vertices(decoded, pose), pose)
 
     def _pulled_back(
         self,
-        level: int,
-        stored: dict[str, mi.Float],
-        shape: Shape,
-        layer: TexelLayer | None,
+        pose: Pose,
+        stored: Values,
+        decoded: Decoded,
         drawn: Drawn,
         rendered: gradient.RenderedBatch,
         by_image: mi.Float,
         target: Target,
         laplacian_weight: mi.Float,
         want_loss: bool,
-    ) -> tuple[mi.Float | None, dict[str, mi.Float]]:
-        """(loss of the deferred pixels, gradient of every parameter). ``level``: as in
-        ``_surface``."""
-        model = self.model
-        shape, layer = model.track(shape, layer)
-        posed = model.drawn.pose(shape)
-        drawn = replace(drawn, surface=model.surface(posed), maps=model.maps(layer))
+    ) -> tuple[mi.Float | None, Values]:
+        """(loss of the deferred pixels, gradient of every parameter)."""
+        latent = self.latent
+        tracked = latent.track(decoded)
+        vertices = latent.vertices(tracked, pose)
+        surface = latent.surface(vertices, pose)
+        drawn = replace(drawn, surface=surface, maps=latent.maps(tracked))
 
         def pixel_loss(color: mi.Color3f, pixel: mi.UInt32) -> mi.Float:
             return covered_loss(self.loss, target, color, pixel)
@@ -168,11 +159,11 @@ class Gradients:
         direct = gradient.direct(rendered, drawn, pixel_loss)
         if direct is not None:
             terms.append(direct)
-        if dr.grad_enabled(posed) and level in self.laplacians:
-            terms.append(self.laplacians[level].per_vertex(posed) * laplacian_weight)
+        if dr.grad_enabled(vertices) and pose.level in self.laplacians:
+            terms.append(self.laplacians[pose.level].per_vertex(vertices) * laplacian_weight)
         gradient.backward(terms)
         value = dr.detach(direct) if want_loss and direct is not None else None
-        return value, model.gradients(shape, layer, stored)
+        return value, latent.gradients(tracked, stored)
 
 
 def step(
@@ -187,7 +178,7 @@ def step(
     bad = check(grads)
     values, after = {}, {}
     if bad is None:
-        for name, parameter in gradients.model.parameters.items():
+        for name, parameter in gradients.latent.parameters.items():
             values[name], after[name] = adam.update(
                 parameter, grads[name], moments[name], inputs.rate
             )

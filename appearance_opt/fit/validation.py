@@ -9,20 +9,19 @@ import numpy as np
 from appearance_opt.errors import DivergedError
 from appearance_opt.reference.pool import check_images
 from appearance_opt.render.display import display
-from appearance_opt.render.drawn import Drawn
 from appearance_opt.render.images import render_image
 from appearance_opt.render.pixels import Batch, Grid
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from appearance_opt.fit.model import Model
+    from appearance_opt.latent.latent import Latent
     from appearance_opt.reference.base import Reference
     from appearance_opt.views import Views
 
 
 class Validation:
-    """Fixed views that the fit never sees, and the score of a model on them."""
+    """Fixed views that the fit never sees, and the score of a latent on them."""
 
     def __init__(
         self, reference: Reference, views: Views, resolution: int, samples: int = 9
@@ -35,30 +34,29 @@ class Validation:
         self._reference = display(images)
         self._covered = images[..., 3] > 0
 
-    def render(self, model: Model) -> NDArray[np.float32]:
-        """The model in the held-out views: (B, H, W, 4) premultiplied linear radiance and
+    def render(self, latent: Latent) -> NDArray[np.float32]:
+        """The latent in the held-out views: (B, H, W, 4) premultiplied linear radiance and
         coverage."""
-        surface = model.surface(model.posed())
-        drawn = Drawn(model.scene, surface, model.maps(model.fitted_layer()))
-        image = render_image(drawn, Batch(self.views.records(), self._grid), self.samples)
+        batch = Batch(self.views.records(), self._grid)
+        image = render_image(latent.drawn(), batch, self.samples)
         return np.array(image).reshape(len(self.views), self.resolution, self.resolution, 4)
 
-    def psnr(self, model: Model) -> float:
-        """Mean over the views of the PSNR in dB of display values (sRGB, clipped) over the pixels
-        that either image covers; with several tessellation levels also over those. Raises
-        DivergedError if the model's own image is not finite."""
-        current = model.level
+    def psnr(self, latent: Latent) -> float:
+        """Mean over views and poses of the PSNR in dB of display values (sRGB, clipped) over the
+        pixels that either image covers. Raises DivergedError if the latent's own image is not
+        finite."""
+        current = latent.pose
         each = []
         try:
-            for level in model.levels:
-                model.select(level)
-                each.append(self._psnr(model))
+            for pose in latent.poses:
+                latent.select(pose)
+                each.append(self._psnr(latent))
         finally:
-            model.select(current)
+            latent.select(current)
         return float(np.mean(each))
 
-    def _psnr(self, model: Model) -> float:
-        image = self.render(model)
+    def _psnr(self, latent: Latent) -> float:
+        image = self.render(latent)
         finite = np.isfinite(image).all(axis=(1, 2, 3))
         if not finite.all():
             raise DivergedError(

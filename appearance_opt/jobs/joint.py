@@ -90,8 +90,8 @@ def _fit_job(
 ) -> SimplifyResult:
     from appearance_opt.baking.closed_form import Settings, bake
     from appearance_opt.baking.target_mesh import movable
-    from appearance_opt.fit.model import Model, Rates
     from appearance_opt.initial.transfer import transfer_emission
+    from appearance_opt.latent.build import latent_of
     from appearance_opt.stages.displacement import Exporter, bake_displacement
     from appearance_opt.stages.fitting import clean_maps, fit_start
     from appearance_opt.stages.plain import flatten_maps
@@ -123,7 +123,7 @@ def _fit_job(
         with_report=with_report,
     )
     exporter = Exporter(job.placement, light.origin, light.name)
-    initial = Model(mesh, start.maps, frozenset(), Rates(), start.levels[-1:])
+    initial = latent_of(mesh, start.maps, levels=start.levels[-1:])
     final = clean_maps(model, start.known)
     final |= transfer_emission(job.survey, model.posed_mesh(), options.texture.size)
     final = flatten_maps(model, final, start, job.subject.reference, job.subject.sampler, options)
@@ -132,7 +132,7 @@ def _fit_job(
     result = SimplifyResult(
         with_kept(exporter.base(model, final)),
         {
-            "start": with_kept(exporter.drawn(initial, start.maps)[initial.level]),
+            "start": with_kept(exporter.drawn(initial, start.maps)[initial.pose.level]),
             **{f"level {k}": a for k, a in tessellated.items()},
         },
         title=f"{job.high.name}: {before:,} to {after:,} triangles",

@@ -271,8 +271,8 @@ class _Job:
 
     def fit(self) -> SimplifyResult:
         """Fit the start; see ``simplify``."""
-        from appearance_opt.fit.model import Model, Rates
         from appearance_opt.initial.transfer import transfer_emission
+        from appearance_opt.latent.build import latent_of
         from appearance_opt.stages.displacement import Exporter
         from appearance_opt.stages.fitting import clean_maps, fit_start
         from appearance_opt.stages.plain import flatten_maps
@@ -295,10 +295,8 @@ class _Job:
         asset = self.parts.fitted
         name = f"{asset.name}_{len(self.start.mesh.faces)}"
         exporter = Exporter(self.subject.placement, asset.origin, name)
-        initial = Model(
-            self.start.mesh, self.start.maps, frozenset(), Rates(), self.start.levels[-1:]
-        )
-        begin = exporter.drawn(initial, self.start.maps)[initial.level]
+        initial = latent_of(self.start.mesh, self.start.maps, levels=self.start.levels[-1:])
+        begin = exporter.drawn(initial, self.start.maps)[initial.pose.level]
         maps = clean_maps(model, self.start.known)
         maps |= transfer_emission(require_survey(self.subject), model.posed_mesh(), o.texture.size)
         maps = flatten_maps(

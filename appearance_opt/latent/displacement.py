@@ -16,30 +16,34 @@ import mitsuba as mi
 import numpy as np
 
 from appearance_opt.latent import mesh_ops
-from appearance_opt.latent.mesh import LatentMesh, LatentTopology, corners_of, edges_around
+from appearance_opt.latent.mesh import LatentMesh, corners_of, edges_around, local_edge_length
+from appearance_opt.latent.parts import Part, Pose
 from appearance_opt.latent.subdivision import tessellate
+from appearance_opt.latent.texels import PackedMaps
 from appearance_opt.render.math import unit
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     from numpy.typing import NDArray
 
+    from appearance_opt.latent.parameter import Rates
     from appearance_opt.render.material import TexelLayer
 
-DISPLACEMENT = "displacement"
-"""Name of the channel."""
+DISPLACEMENT, TESSELLATION = "displacement", "tessellation"
+"""Names of the parts; the first is also that of the channel."""
 
 
 class Tessellator:
     """From base positions and a displacement map to the positions of one tessellation level.
 
-    ``topology``: connectivity of the tessellated mesh, which makes normals and tangent bases of the
-    displaced surface. All else is precomputed: base vertices and weights of each vertex, where it
-    reads the map and how finely.
+    ``mesh``: the tessellated mesh, not displaced. Precomputed are the base vertices and weights of
+    each of its vertices, where it reads the map and how finely.
     """
 
-    def __init__(self, base: LatentMesh, level: int, tangents: bool) -> None:
+    def __init__(self, base: LatentMesh, level: int) -> None:
         fine = tessellate(base, level)
-        self.topology = LatentTopology(fine.mesh, tangents)
+        self.mesh = fine.mesh
         self._base = corners_of(base)
         self._parents = [
             mi.UInt32(np.ascontiguousarray(fine.parents[:, k], np.uint32)) for k in range(3)
@@ -76,7 +80,7 @@ class Tessellator:
         value = relief.pyramid.lookup(None, self._uv, self._footprint)[
             relief.channels.index(DISPLACEMENT)
         ]
-        total = dr.zeros(mi.Float, len(self.topology.mesh.positions))
+        total = dr.zeros(mi.Float, len(self.mesh.positions))
         dr.scatter_add(total, value * self._share, self._vertex)
         return total
 
@@ -87,6 +91,64 @@ class Tessellator:
             dr.fma(rows[0][c], w[0], dr.fma(rows[1][c], w[1], rows[2][c] * w[2]))
             for c in range(first, first + 3)
         ]
+
+
+class Tessellation(Part):
+    """The mesh drawn with more triangles, at one of some ``levels`` at a time; nothing of it is
+    stored. ``base``: the mesh of level 0."""
+
+    places = True
+
+    def __init__(self, base: LatentMesh, levels: Iterable[int]) -> None:
+        super().__init__(TESSELLATION)
+        self._levels = tessellators(base, levels)
+
+    def mesh(self, before: LatentMesh, level: int) -> LatentMesh:
+        return self._levels[level].mesh
+
+    def place(self, vertices: mi.Float, decoded: None, pose: Pose) -> mi.Float:
+        return self._levels[pose.level](vertices, None)
+
+    def fixed(self) -> tuple:
+        return (self._levels,)
+
+
+class Height(PackedMaps):
+    """The displacement map, and the tessellated mesh that it displaces. ``image``: (size, size) in
+    the units of the positions."""
+
+    places = True
+
+    def __init__(
+        self, base: LatentMesh, levels: Iterable[int], image: NDArray, fitted: bool
+    ) -> None:
+        super().__init__(DISPLACEMENT, {DISPLACEMENT: image}, fitted)
+        self._levels = tessellators(base, levels)
+
+    def mesh(self, before: LatentMesh, level: int) -> LatentMesh:
+        return self._levels[level].mesh
+
+    def place(self, vertices: mi.Float, decoded: TexelLayer, pose: Pose) -> mi.Float:
+        return self._levels[pose.level](vertices, decoded)
+
+    def fixed(self) -> tuple:
+        return (*super().fixed(), self._levels)
+
+    def set_rates(self, rates: Rates) -> None:
+        assert self.parameter is not None
+        finest = self._levels[max(self._levels)].mesh
+        edge = float(local_edge_length(finest.positions, finest.faces).mean())
+        self.parameter.rate = mi.Float(edge * rates.displacement)
+
+    def export(self) -> dict[str, NDArray[np.float32]]:
+        size = self.codec.size
+        texels = np.array(self.now().pyramid.texels)[: size * size]
+        return {DISPLACEMENT: texels.reshape(size, size)}
+
+
+def tessellators(base: LatentMesh, levels: Iterable[int]) -> dict[int, Tessellator]:
+    """One for each level."""
+    return {level: Tessellator(base, level) for level in levels}
 
 
 def footprint(mesh: LatentMesh) -> NDArray[np.float32]:

@@ -27,3 +27,16 @@ class Parameter:
     low: mi.Float | None = None
     high: mi.Float | None = None
     smooth: Callable[[mi.Float], mi.Float] | None = None
+
+
+@dataclass(frozen=True)
+class Rates:
+    """Learning rates at the start of a fit. ``position``: in units of the local edge length;
+    ``displacement``: in units of the mean edge length of the finest tessellation; the others in the
+    units of their maps (colours: square root of linear)."""
+
+    position: float = 0.01
+    normal: float = 0.01
+    base_color: float = 0.005
+    material: float = 0.005
+    displacement: float = 0.01

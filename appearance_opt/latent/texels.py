@@ -1,4 +1,5 @@
-"""Fitted maps: packed texels, their encoding, and the mip pyramid that the renderer reads.
+"""Maps as packed texels: their encoding, the mip pyramid that the renderer reads, and the parts of a
+latent that are made of them.
 
 Colours are stored as the square root of linear values, so that a step of the optimiser means about
 the same to the eye in dark and in light regions. Normals are stored with any length, and mean unit
@@ -13,6 +14,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from appearance_opt.latent.parameter import Parameter
+from appearance_opt.latent.parts import Part
 from appearance_opt.render.material import CHANNELS, COLORS, MaterialMaps, TexelLayer
 from appearance_opt.render.texture import CLAMP, Pyramid, downsample, pyramid_layout
 
@@ -20,6 +23,11 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from numpy.typing import NDArray
+
+    from appearance_opt.latent.parameter import Rates
+
+TEXELS, FIXED_TEXELS = "texels", "fixed texels"
+"""Names of the parts: the maps that are fitted, and those that are not."""
 
 BOUNDS = {
     **dict.fromkeys(COLORS, (0.0, 1.0)),
@@ -167,3 +175,68 @@ def maps_of(values: Mapping[str, NDArray | float]) -> MaterialMaps:
     codec = TexelCodec(tuple(images), len(next(iter(images.values()))))
     constants = {n: float(v) for n, v in values.items() if not np.ndim(v)}
     return MaterialMaps((codec.layer(codec.encode(images)),), constants)
+
+
+class PackedMaps(Part):
+    """Maps in one atlas, whose mip levels are means of its texels. ``images``: natural values,
+    channel name -> (size, size)."""
+
+    def __init__(self, name: str, images: Mapping[str, NDArray], fitted: bool) -> None:
+        channels = tuple(images)
+        self.codec = codec = TexelCodec(channels, len(images[channels[0]]))
+        stored = codec.encode(images)
+        if not fitted:
+            super().__init__(name, None, codec.layer(stored))
+            return
+        low, high = (codec.per_channel({n: BOUNDS[n][k] for n in channels}) for k in (0, 1))
+        super().__init__(name, Parameter(name, stored, codec.packed, mi.Float(0), low, high))
+
+    def decode(self, stored: mi.Float) -> TexelLayer:
+        return self.codec.layer(stored)
+
+    def track(self, decoded: TexelLayer) -> TexelLayer:
+        texels = mi.Float(decoded.pyramid.texels)
+        dr.enable_grad(texels)
+        return decoded.with_texels(texels)
+
+    def pull_back(self, tracked: TexelLayer, stored: mi.Float) -> mi.Float:
+        return self.codec.pull_back(dr.grad(tracked.pyramid.texels), stored)
+
+    def fixed(self) -> tuple:
+        return (self.codec, self.constant)
+
+
+class Texels(PackedMaps):
+    """Maps of the material. Those that are fitted and those that are not are parts of their own:
+    the latter have no gradient and no moments."""
+
+    def __init__(self, images: Mapping[str, NDArray], fitted: bool) -> None:
+        super().__init__(TEXELS if fitted else FIXED_TEXELS, images, fitted)
+        self.channels = self.codec.channels
+        self._start = None if self.parameter is None else self.parameter.value
+        self._images = {} if fitted else {n: v.astype(np.float32) for n, v in images.items()}
+
+    def layers(self, decoded: TexelLayer) -> tuple[TexelLayer, ...]:
+        return (decoded,)
+
+    def set_rates(self, rates: Rates) -> None:
+        assert self.parameter is not None
+        per_channel = {n: _rate_of(n, rates) for n in self.channels}
+        self.parameter.rate = self.codec.per_channel(per_channel)
+
+    def export(self) -> dict[str, NDArray[np.float32]]:
+        if self.parameter is None:
+            return dict(self._images)
+        return self.codec.to_maps(self.parameter.value)
+
+    def changed(self) -> NDArray[np.bool_]:
+        """(size, size) texels of fitted maps that differ from those of the start."""
+        assert self.parameter is not None
+        differs = np.array(self.parameter.value) != np.array(self._start)
+        return differs.reshape(self.codec.size, self.codec.size, -1).any(axis=-1)
+
+
+def _rate_of(channel: str, rates: Rates) -> float:
+    if channel in NORMALS:
+        return rates.normal
+    return rates.base_color if channel in COLORS else rates.material

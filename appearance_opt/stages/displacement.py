@@ -17,7 +17,7 @@ from appearance_opt.asset.height import displacement_of, height_png
 from appearance_opt.baking.closed_form import Settings, bake
 from appearance_opt.errors import InputError
 from appearance_opt.initial.atlas import GUTTER
-from appearance_opt.latent.displacement import DISPLACEMENT, Tessellator, footprint
+from appearance_opt.latent.displacement import DISPLACEMENT, Height, Tessellator, footprint
 from appearance_opt.latent.export import to_asset
 from appearance_opt.latent.subdivision import tessellate
 from appearance_opt.latent.texels import TexelCodec
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from appearance_opt.asset.origin import Origin
     from appearance_opt.asset.types import Asset
     from appearance_opt.config import CommonOptions
-    from appearance_opt.fit.model import Model
+    from appearance_opt.latent.latent import Latent
     from appearance_opt.latent.mesh import LatentMesh
     from appearance_opt.placement import Placement
     from appearance_opt.reference.survey import Survey
@@ -108,12 +108,12 @@ def bake_displacement(
     found = bake(survey, mesh, settings).maps[DISPLACEMENT]
     found = without_outliers(found, OUTLIER * median_edge(mesh) / 2**level)
     with dr.suspend_grad():
-        tessellator = Tessellator(mesh, level, tangents=False)
+        tessellator = Tessellator(mesh, level)
         codec = TexelCodec((DISPLACEMENT,), size)
         layer = codec.layer(codec.encode({DISPLACEMENT: found}))
         flat = mi.Float(np.ascontiguousarray(mesh.positions, np.float32).ravel())
         positions = np.array(tessellator(flat, layer)).reshape(-1, 3)
-    return replace(tessellator.topology.mesh, positions=positions), {DISPLACEMENT: found}
+    return replace(tessellator.mesh, positions=positions), {DISPLACEMENT: found}
 
 
 def median_edge(mesh: LatentMesh) -> float:
@@ -136,12 +136,13 @@ class Exporter:
     def __init__(self, placement: Placement, origin: Origin, name: str) -> None:
         self.placement, self.origin, self.name = placement.relative_to(origin), origin, name
 
-    def base(self, model: Model, maps: dict) -> Asset:
+    def base(self, model: Latent, maps: dict) -> Asset:
         """The base mesh, its maps, and the displacement map in metres."""
         asset = self._asset(model.mesh, model.host_positions(), maps, self.name)
-        heights = model.host_displacement()
-        if heights is None:
+        height = model.part(Height)
+        if height is None:
             return asset
+        heights = height.export()[DISPLACEMENT]
         displacement = displacement_of(heights * np.float32(self.placement.scale))
         meshes = (
             replace(m, material=replace(m.material, displacement=displacement))
@@ -149,12 +150,13 @@ class Exporter:
         )
         return replace(asset, meshes=tuple(meshes))
 
-    def drawn(self, model: Model, maps: dict) -> dict[int, Asset]:
+    def drawn(self, model: Latent, maps: dict) -> dict[int, Asset]:
         """The mesh as it is drawn at each tessellation level."""
-        return {
-            k: self._asset(*model.host_drawn(k), maps, f"{self.name}_level{k}")
-            for k in model.levels
-        }
+        out = {}
+        for pose in model.poses:
+            mesh, name = model.posed_mesh(pose), f"{self.name}_level{pose.level}"
+            out[pose.level] = self._asset(mesh, mesh.positions, maps, name)
+        return out
 
     def _asset(self, mesh: LatentMesh, positions: NDArray, maps: dict, name: str) -> Asset:
         return replace(

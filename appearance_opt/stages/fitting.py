@@ -10,10 +10,13 @@ import numpy as np
 
 from appearance_opt.errors import DivergedError
 from appearance_opt.fit.loop import FitOptions, FitResult, fit
-from appearance_opt.fit.model import Model, Rates
 from appearance_opt.fit.validation import Validation
 from appearance_opt.initial.fill import fill
+from appearance_opt.latent.build import latent_of
 from appearance_opt.latent.displacement import DISPLACEMENT
+from appearance_opt.latent.latent import Latent
+from appearance_opt.latent.parameter import Rates
+from appearance_opt.latent.texels import Texels
 from appearance_opt.reference.pool import ReferencePool
 from appearance_opt.render.quality import Quality
 from appearance_opt.views import VALIDATION
@@ -113,7 +116,7 @@ def fit_start(
     progress: Progress | None = None,
     checkpointer: Checkpointer | None = None,
     with_report: bool = False,
-) -> tuple[Model, FitResult, DivergedError | None]:
+) -> tuple[Latent, FitResult, DivergedError | None]:
     """Fit what ``options.fit.parts`` names, from ``start``, within what is left of the budget on
     ``watch``.
 
@@ -137,7 +140,7 @@ def fit_start(
     held_out = sampler.held_out(VALIDATION).draw(0, VALIDATION_VIEWS)
     validation = Validation(reference, held_out, min(o.views.resolution, 256))
     parts = frozenset(o.fit.parts) | ({DISPLACEMENT} if o.displacement.fitted else set())
-    model = Model(start.mesh, start.maps, parts, Rates(), start.levels)
+    model = latent_of(start.mesh, start.maps, parts, Rates(), start.levels)
     quality, rates = fit_policy(
         validation.psnr(model), start.relative, start.grown, patience(o, watch, with_report)
     )
@@ -236,15 +239,16 @@ def fit_policy(
     return Quality(), Rates(still * rate, rate, rate, rate, DISPLACEMENT_RATE * rate)
 
 
-def clean_maps(model: Model, known: NDArray) -> dict:
+def clean_maps(model: Latent, known: NDArray) -> dict:
     """The model's maps and constants. Where nothing was known at the start (``known`` is false
     everywhere), texels that no view ever touched are filled from those that one did; other starts
     were filled before the fit, which may since have moved gutters that lookups reach: filling them
     again would undo that."""
     maps = model.host_maps()
     out: dict = {**model.constants, **maps}
-    if not maps or known.any() or model.codec is None:
+    texels = model.fitted(Texels)
+    if known.any() or texels is None:
         return out
-    names = model.codec.channels
-    stacked = fill(np.stack([maps[n] for n in names], axis=-1), model.changed())
+    names = texels.channels
+    stacked = fill(np.stack([maps[n] for n in names], axis=-1), texels.changed())
     return {**out, **{n: stacked[..., k] for k, n in enumerate(names)}}

@@ -18,14 +18,17 @@ import numpy as np
 from appearance_opt.config import with_values
 from appearance_opt.errors import InputError
 from appearance_opt.fit.loop import FitOptions, FitResult, fit
-from appearance_opt.fit.model import Model, Rates
 from appearance_opt.fit.validation import Validation
 from appearance_opt.initial.atlas import unwrap
 from appearance_opt.initial.decimate import decimate
 from appearance_opt.initial.sphere import random_maps, sphere
 from appearance_opt.interrupts import Interrupts
+from appearance_opt.latent.build import latent_of
 from appearance_opt.latent.export import to_asset
+from appearance_opt.latent.latent import Latent
 from appearance_opt.latent.mesh import LatentMesh
+from appearance_opt.latent.parameter import Rates
+from appearance_opt.latent.positions import Positions
 from appearance_opt.reference.mesh import MeshReference
 from appearance_opt.reference.pool import ReferencePool
 from appearance_opt.reference.survey import MeshSurvey
@@ -137,13 +140,15 @@ def _fit_shape(
     maps: Mapping[str, NDArray | float],
     pace: float,
     effort: Effort,
-) -> tuple[Model, FitResult]:
+) -> tuple[Latent, FitResult]:
     """A mesh with maps after preconditioned steps, ``pace`` times as large as for a sphere; the
     model is left at its best state."""
     reference, sampler = subject.reference, subject.sampler
-    model = Model(mesh, maps, frozenset(options.fit.parts), RATES)
+    model = latent_of(mesh, maps, frozenset(options.fit.parts), RATES)
     strength, rate = smoothing(len(mesh.faces))
-    model.precondition(strength, pace * rate)
+    positions = model.fitted(Positions)
+    if positions is not None:
+        positions.precondition(strength, pace * rate)
     pool = ReferencePool(
         reference, sampler, POOL, VIEWS, RESOLUTION, POOL_SAMPLES, POINT_WIDTH, options.views.reuse
     )

@@ -10,7 +10,7 @@ import numpy as np
 
 from appearance_opt.asset.packing import EMISSION
 from appearance_opt.asset.types import linear_to_srgb
-from appearance_opt.latent.texels import NORMALS
+from appearance_opt.latent.texels import NORMALS, Texels
 from appearance_opt.reference.pool import check_images
 from appearance_opt.render.display import display
 from appearance_opt.render.drawn import Drawn
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from appearance_opt.config import CommonOptions
-    from appearance_opt.fit.model import Model
+    from appearance_opt.latent.latent import Latent
     from appearance_opt.reference.base import Reference
     from appearance_opt.stages.start import Start
     from appearance_opt.views import ViewSampler
@@ -51,7 +51,7 @@ GROUPS = (COLORS, ("roughness",), ("metalness",), NORMALS, EMISSION)
 
 
 def flatten_maps(
-    model: Model,
+    model: Latent,
     maps: Maps,
     start: Start,
     reference: Reference,
@@ -61,7 +61,7 @@ def flatten_maps(
     """The ``maps`` of a fitted model as they are to be written: see ``replace_constant``."""
     judge = (
         None
-        if model.codec is None
+        if model.fitted(Texels) is None
         else Pictures(model, reference, sampler, min(options.views.resolution, 256))
     )
     return replace_constant(maps, start.known, judge, start.maps)
@@ -163,10 +163,11 @@ class Pictures:
     """A ``Judge`` that draws a model, which has fitted maps, in views that its fit has not seen."""
 
     def __init__(
-        self, model: Model, reference: Reference, sampler: ViewSampler, resolution: int
+        self, model: Latent, reference: Reference, sampler: ViewSampler, resolution: int
     ) -> None:
-        assert model.codec is not None
-        self._model, self._codec, self.channels = model, model.codec, model.codec.channels
+        texels = model.fitted(Texels)
+        assert texels is not None
+        self._model, self._texels, self.channels = model, texels, texels.channels
         self._reference, self._resolution = reference, resolution
         self._views = sampler.held_out(VALIDATION).draw(0, VIEWS)
 
@@ -191,7 +192,8 @@ class Pictures:
 
     def _drawn(self, maps: Mapping[str, NDArray | float]) -> NDArray[np.float32]:
         model, batch = self._model, Batch(self._views.records(), Grid(VIEWS, self._resolution))
-        layer = self._codec.layer(self._codec.encode(maps))
-        drawn = Drawn(model.scene, model.surface(model.posed()), model.maps(layer))
+        codec = self._texels.codec
+        layer = {self._texels.name: codec.layer(codec.encode(maps))}
+        drawn = Drawn(model.scene, model.surface(model.vertices()), model.maps(layer))
         image = render_image(drawn, batch, SAMPLES)
         return display(np.array(image).reshape(VIEWS, self._resolution, self._resolution, 4))

@@ -58,9 +58,10 @@ def limits(asset: str, steps: int, views: int) -> dict:
     from appearance_opt import backend, bake_options, load
     from appearance_opt.baking.closed_form import Settings, bake
     from appearance_opt.fit.loop import FitOptions, fit
-    from appearance_opt.fit.model import Model, Rates
     from appearance_opt.fit.validation import Validation
     from appearance_opt.jobs.bake import BakeJob
+    from appearance_opt.latent.build import latent_of
+    from appearance_opt.latent.parameter import Rates
     from appearance_opt.reference.pool import ReferencePool
     from appearance_opt.stages.fitting import POOL_SAMPLES, Stopwatch, fit_policy, point_width
     from appearance_opt.views import MEASURED, Views
@@ -74,7 +75,7 @@ def limits(asset: str, steps: int, views: int) -> dict:
     maps = dict(bake(job.reference, job.mesh, Settings(SIZE, samples=4)).maps)
     sampler = job.sampler.held_out(MEASURED)
     drawn = Views.concatenate([sampler.draw(k, 4) for k in range(views // 4)])
-    model = Model(job.mesh, maps, frozenset({"normal", "material"}), Rates())
+    model = latent_of(job.mesh, maps, frozenset({"normal", "material"}), Rates())
     exact = Validation(job.reference, drawn, RESOLUTION, 16)
     model.set_rates(fit_policy(exact.psnr(model), likeness=True)[1])
     images = job.reference.render(drawn, RESOLUTION, 16)

@@ -110,7 +110,6 @@ def run_case(
     from appearance_opt.fit.loop import LOSS_EVERY
     from appearance_opt.fit.losses import LOSSES
     from appearance_opt.fit.step import Gradients, StepInputs, first_non_finite, step
-    from appearance_opt.latent.laplacian import Laplacian
     from appearance_opt.options.views import ViewOptions
     from appearance_opt.reference.pool import ReferencePool, Targets
     from appearance_opt.render.pixels import Batch, Grid
@@ -121,11 +120,14 @@ def run_case(
     source, model, sampler = set_up(latent, reference, maps, room)
     grid = Grid(4, resolution)
     mesh = model.topology.mesh
-    laplacian = Laplacian(mesh.positions, mesh.faces, model.edge_length, relative=True)
     moments = {n: adam.moments_of(p) for n, p in model.parameters.items()}
     width = point_width(resolution, maps)
     gradients = Gradients(
-        model, grid, Quality(point_width=width), LOSSES["log-srgb-l1"], {0: laplacian}
+        model,
+        grid,
+        Quality(point_width=width),
+        LOSSES["log-srgb-l1"],
+        model.laplacians(relative=True),
     )
     views = [sampler.draw(k, 4) for k in range(8)]
     kept = [Targets(source.render_device(Batch(v.records(), grid), 1)) for v in views]

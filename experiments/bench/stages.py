@@ -18,11 +18,12 @@ import numpy as np
 from appearance_opt import backend
 from appearance_opt.fit import adam
 from appearance_opt.fit.losses import LOSSES, Target, compared_pixels, covered_loss, image_loss
-from appearance_opt.fit.model import POSITIONS, TEXELS, Shape
+from appearance_opt.latent.latent import Decoded
+from appearance_opt.latent.positions import POSITIONS
+from appearance_opt.latent.texels import TEXELS, Texels
 from appearance_opt.render import gradient
 from appearance_opt.render.drawn import Drawn
 from appearance_opt.render.freezing import Frozen
-from appearance_opt.render.material import TexelLayer
 from appearance_opt.render.pixels import Batch, Grid
 from appearance_opt.render.quality import Quality
 from appearance_opt.stages.fitting import point_width
@@ -73,16 +74,18 @@ def stages(resolution: int, maps: int) -> dict[str, float]:
 
     def rebuild() -> None:
         # a new array: Mitsuba skips parameters that are the same as before
-        model.parameters[POSITIONS].value = model.positions() + dr.opaque(mi.Float, 0.0)
+        model.parameters[POSITIONS].value = model.vertices() + dr.opaque(mi.Float, 0.0)
         model.update_scene()
 
     timed("BVH of the latent", rebuild)
-    timed("texels to mip pyramid", lambda: model.fitted_layer().pyramid.texels)
-    positions = mi.Float(model.positions())
+    texels = model.fitted(Texels)
+    assert texels is not None
+    timed("texels to mip pyramid", lambda: texels.now().pyramid.texels)
+    positions = mi.Float(model.vertices())
     dr.enable_grad(positions)
     timed("normals and tangent bases", lambda: model.surface(positions).vertices)
-    surface, layer = model.surface(positions), model.fitted_layer()
-    drawn = Drawn(model.scene, surface, model.maps(layer), model.topology.edges)
+    decoded = model.decode(model.values())
+    drawn = model.drawn(decoded, model.surface(positions))
     loss, target = LOSSES["log-srgb-l1"], Target.of(reference, np.full((4, 3), 0.3))
     run = Frozen(model.fixed(), grid)
 
@@ -101,28 +104,28 @@ def stages(resolution: int, maps: int) -> dict[str, float]:
     _, by_image = averaged()
 
     def backward() -> tuple:
-        return run(pulled_back, drawn, rendered, model.shape(), layer, by_image)
+        return run(pulled_back, drawn, rendered, decoded, by_image)
 
     def pulled_back(
         drawn: Drawn,
         rendered: gradient.RenderedBatch,
-        shape: Shape,
-        layer: TexelLayer,
+        decoded: Decoded,
         by_image: mi.Float,
     ) -> tuple:
-        shape, layer = model.track(shape, layer)
-        moving = replace(drawn, surface=model.surface(shape.positions), maps=model.maps(layer))
+        tracked = model.track(decoded)
+        surface = model.surface(model.vertices(tracked))
+        moving = replace(drawn, surface=surface, maps=model.maps(tracked))
         terms = gradient.surrogate(rendered, moving, by_image)
         direct = gradient.direct(
             rendered, moving, lambda c, pixel: covered_loss(loss, target, c, pixel)
         )
         gradient.backward([*terms, direct])
-        return dr.grad(shape.positions), dr.grad(layer.pyramid.texels)
+        return dr.grad(tracked[POSITIONS]), dr.grad(tracked[TEXELS].pyramid.texels)
 
     grads = timed("shading, loss and gradients of all other pixels", backward)
     parameter = model.parameters[TEXELS]
-    timed("pyramid gradient to texels", lambda: model.codec.pull_back(grads[1], parameter.value))
-    down = model.codec.pull_back(grads[1], parameter.value)
+    timed("pyramid gradient to texels", lambda: texels.codec.pull_back(grads[1], parameter.value))
+    down = texels.codec.pull_back(grads[1], parameter.value)
     moments = {n: adam.moments_of(p) for n, p in model.parameters.items()}
     timed("Adam, texels", lambda: adam.update(parameter, down, moments[TEXELS], 1.0)[0])
     timed(

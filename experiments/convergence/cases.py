@@ -13,9 +13,12 @@ from numpy.typing import NDArray
 from appearance_opt.asset import load
 from appearance_opt.config import simplify_options
 from appearance_opt.fit.loop import FitOptions
-from appearance_opt.fit.model import Model, Rates
 from appearance_opt.fit.validation import Validation
 from appearance_opt.initial.sphere import random_maps
+from appearance_opt.latent.build import latent_of
+from appearance_opt.latent.latent import Latent
+from appearance_opt.latent.parameter import Rates
+from appearance_opt.latent.positions import Positions
 from appearance_opt.reference.pool import ReferencePool
 from appearance_opt.reference.subject import Subject
 from appearance_opt.stages import growth
@@ -38,7 +41,7 @@ class Case:
     ``options`` lack the time."""
 
     name: str
-    make: Callable[[], Model]
+    make: Callable[[], Latent]
     pool: ReferencePool
     validation: Validation
     options: FitOptions
@@ -75,9 +78,11 @@ def _from_sphere(subject: Subject, seed: int) -> Case:
     mesh = growth.first_shape(1404, subject.sampler, growth.TEXTURE)
     maps = random_maps(growth.TEXTURE, seed, True)
 
-    def make() -> Model:
-        model = Model(mesh, maps, frozenset(("shape", "normal", "material")), growth.RATES)
-        model.precondition(*growth.smoothing(len(mesh.faces)))
+    def make() -> Latent:
+        model = latent_of(mesh, maps, frozenset(("shape", "normal", "material")), growth.RATES)
+        positions = model.fitted(Positions)
+        assert positions is not None
+        positions.precondition(*growth.smoothing(len(mesh.faces)))
         return model
 
     pool = ReferencePool(
@@ -128,8 +133,8 @@ def _from_mesh(
     )
     validation = _validation(subject)
 
-    def fresh(rates: Rates) -> Model:
-        return Model(start.mesh, start.maps, frozenset(("shape", "normal", "material")), rates)
+    def fresh(rates: Rates) -> Latent:
+        return latent_of(start.mesh, start.maps, frozenset(("shape", "normal", "material")), rates)
 
     _, rates = fit_policy(validation.psnr(fresh(Rates())), True)
     # a bent start must not be held in its shape

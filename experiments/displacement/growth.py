@@ -29,11 +29,11 @@ def measure(triangles: int, level: int) -> str:
     import drjit as dr
     import mitsuba as mi
 
-    from appearance_opt.fit.loop import laplacians
     from appearance_opt.fit.losses import LOSSES
-    from appearance_opt.fit.model import Model, Rates
     from appearance_opt.fit.step import Gradients, StepInputs
     from appearance_opt.initial.sphere import sphere
+    from appearance_opt.latent.build import latent_of
+    from appearance_opt.latent.parameter import Rates
     from appearance_opt.reference.pool import Targets
     from appearance_opt.render.pixels import Grid
     from appearance_opt.render.quality import Quality
@@ -49,9 +49,9 @@ def measure(triangles: int, level: int) -> str:
     }
     maps |= {"normal_x": flat, "normal_y": flat, "normal_z": flat + 1, "displacement": flat}
     parts = frozenset({"shape", "material", "normal", "displacement"})
-    model = Model(sphere(triangles, (0.0, 0.0, 0.0), 1.0, SIZE), maps, parts, Rates(), (level,))
+    model = latent_of(sphere(triangles, (0.0, 0.0, 0.0), 1.0, SIZE), maps, parts, Rates(), (level,))
     grid = Grid(4, 256)
-    gradients = Gradients(model, grid, Quality(), LOSSES["log-srgb-l1"], laplacians(model, True))
+    gradients = Gradients(model, grid, Quality(), LOSSES["log-srgb-l1"], model.laplacians(True))
     views = ViewSampler((0.0, 0.0, 0.0), 1.0, seed=1).draw(0, 4)
     reference = Targets(mi.Float(np.full(grid.pixels * 4, 0.3, np.float32)))
     inputs = StepInputs(views, reference, np.zeros((4, 3), np.float32), 1.0, 1.0, 3)

@@ -59,12 +59,13 @@ class Bench:
         """PSNR before, in the middle and after; seconds include the first rendering of the pool's
         views."""
         from appearance_opt.fit.loop import FitOptions, fit
-        from appearance_opt.fit.model import Model, Rates
+        from appearance_opt.latent.build import latent_of
+        from appearance_opt.latent.parameter import Rates
         from appearance_opt.stages.fitting import fit_policy
 
         parts, numbers = case.split(":")
         position, displacement, maps = (float(x) for x in numbers.split(","))
-        model = Model(
+        model = latent_of(
             self.start.mesh,
             self.start.maps,
             frozenset(parts.split("+")),

@@ -17,11 +17,13 @@ import mitsuba as mi
 import numpy as np
 
 from appearance_opt import backend
-from appearance_opt.fit.model import POSITIONS, Model, Rates
 from appearance_opt.initial.sphere import sphere
+from appearance_opt.latent.build import latent_of
+from appearance_opt.latent.latent import Latent
 from appearance_opt.latent.mesh import LatentMesh
+from appearance_opt.latent.parameter import Rates
+from appearance_opt.latent.positions import POSITIONS
 from appearance_opt.render import gradient, silhouette, silhouette_walk
-from appearance_opt.render.drawn import Drawn
 from appearance_opt.render.images import render_image
 from appearance_opt.render.pixels import Batch, Grid
 from appearance_opt.render.quality import Quality
@@ -57,13 +59,12 @@ def ball(splits: int) -> LatentMesh:
     )
 
 
-def estimated(model: Model, batch: Batch, quality: Quality) -> float:
+def estimated(model: Latent, batch: Batch, quality: Quality) -> float:
     """dArea/dScale."""
-    start = np.array(model.positions())
+    start = np.array(model.vertices())
     positions = mi.Float(start)
     dr.enable_grad(positions)
-    surface, edges = model.surface(positions), model.topology.walkable
-    drawn = Drawn(model.scene, surface, model.maps(None), edges)
+    drawn = model.drawn(surface=model.surface(positions), walkable=True)
     rendered = gradient.render(drawn, batch, quality, 0)
     by_image = np.zeros((batch.grid.pixels, 4), np.float32)
     by_image[:, 3] = 1
@@ -71,14 +72,14 @@ def estimated(model: Model, batch: Batch, quality: Quality) -> float:
     return float(np.array(dr.grad(positions)).astype(np.float64) @ start)
 
 
-def measured(model: Model, batch: Batch) -> float:
+def measured(model: Latent, batch: Batch) -> float:
     """The same by differences."""
-    start = np.array(model.positions())
+    start = np.array(model.vertices())
     areas = []
     for scale in (1 + STEP, 1 - STEP):
         model.parameters[POSITIONS].value = mi.Float(start * scale)
         model.update_scene()
-        drawn = Drawn(model.scene, model.surface(model.positions()), model.maps(None))
+        drawn = model.drawn()
         image = render_image(drawn, batch, 64)
         areas.append(float(np.array(image).reshape(-1, 4)[:, 3].astype(np.float64).sum()))
     model.parameters[POSITIONS].value = mi.Float(start)
@@ -93,7 +94,7 @@ def main() -> None:
     constants = {"red": 0.6, "green": 0.3, "blue": 0.2, "roughness": 0.5, "metalness": 0.2}
     columns = []
     for splits in (0, 1, 2):
-        model = Model(ball(splits), constants, frozenset(("shape",)), Rates())
+        model = latent_of(ball(splits), constants, frozenset(("shape",)), Rates())
         truth = measured(model, batch)
         column = [f"{len(model.mesh.faces):,} triangles"]
         for quality, change in SETTINGS.values():

@@ -10,8 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from appearance_opt.fit.losses import LOSSES
-from appearance_opt.fit.model import POSITIONS, Model, Rates
 from appearance_opt.fit.step import Gradients, StepInputs
+from appearance_opt.latent.latent import Latent
+from appearance_opt.latent.parts import Pose
+from appearance_opt.latent.positions import POSITIONS, Positions
 from appearance_opt.reference.pool import Targets
 from appearance_opt.render.pixels import Grid
 from appearance_opt.render.quality import Quality
@@ -19,21 +21,22 @@ from appearance_opt.render.surface import Surface
 from experiments.gradient_error.problems import BACKGROUND, Problem
 
 
-class ColoredModel(Model):
+class ColoredModel(Latent):
     """A model of a problem's mesh with its vertex colours: Mitsuba splits a mesh at the seams of a
     texture."""
 
     def __init__(self, problem: Problem) -> None:
         constants = {"red": 1.0, "green": 1.0, "blue": 1.0}
         constants |= {"roughness": problem.roughness, "metalness": problem.metalness}
-        super().__init__(problem.mesh, constants, frozenset(("shape",)), Rates())
-        self.colors = problem.surface(self.topology, self.positions(), problem.colors).colors
+        super().__init__(problem.mesh, (Positions(problem.mesh, True),), constants, (Pose(),))
+        self.colors = problem.surface(self.topology, self.vertices(), problem.colors).colors
 
     def fixed(self) -> tuple:
         return (*super().fixed(), self.colors)
 
-    def surface(self, positions: mi.Float) -> Surface:
-        return replace(super().surface(positions), frames=None, corners=None, colors=self.colors)
+    def surface(self, vertices: mi.Float, pose: Pose | None = None) -> Surface:
+        whole = super().surface(vertices, pose)
+        return replace(whole, frames=None, corners=None, colors=self.colors)
 
 
 class Ours:
@@ -59,7 +62,7 @@ class Ours:
         """The same on the device, as a step of a fit computes it, acceleration structure
         included."""
         # a new array: Mitsuba skips parameters that are the same as before
-        self.model.parameters[POSITIONS].value = self.model.positions() + dr.opaque(mi.Float, 0.0)
+        self.model.parameters[POSITIONS].value = self.model.vertices() + dr.opaque(mi.Float, 0.0)
         self.model.update_scene()
         inputs = replace(self.inputs, seed=seed)
         if quality not in self._gradients:

@@ -18,12 +18,12 @@ from numpy.typing import NDArray
 
 from appearance_opt import backend
 from appearance_opt.fit.losses import LOSSES
-from appearance_opt.fit.model import TEXELS, Model, Rates
 from appearance_opt.fit.step import Gradients, StepInputs
 from appearance_opt.initial.sphere import sphere
-from appearance_opt.latent.texels import TexelCodec
+from appearance_opt.latent.build import latent_of
+from appearance_opt.latent.parameter import Rates
+from appearance_opt.latent.texels import TEXELS, TexelCodec, Texels
 from appearance_opt.reference.pool import Targets
-from appearance_opt.render.drawn import Drawn
 from appearance_opt.render.images import render_image
 from appearance_opt.render.pixels import Batch, Grid
 from appearance_opt.render.quality import Quality
@@ -91,8 +91,10 @@ def measure(scene: str, size: int, resolution: int) -> list[str]:
     """Table lines of one scene."""
     mesh = sphere(768, (0.0, 0.0, 0.0), 0.85, size)
     maps = wavy_maps(size)
-    model = Model(mesh, {**maps}, frozenset(("normal", "material")), Rates())
-    assert model.codec is not None
+    model = latent_of(mesh, {**maps}, frozenset(("normal", "material")), Rates())
+    texels = model.fitted(Texels)
+    assert texels is not None
+    codec = texels.codec
     grid, views = (
         Grid(1, resolution),
         ViewSampler((0.0, 0.0, 0.0), 1.0, seed=2, light_spread=40.0).draw(0, 1),
@@ -105,13 +107,11 @@ def measure(scene: str, size: int, resolution: int) -> list[str]:
     def image(stored: NDArray) -> NDArray[np.float64]:
         parameter.value = mi.Float(stored)
         with dr.suspend_grad():
-            surface, layer = model.surface(model.positions()), model.fitted_layer()
-            drawn = Drawn(model.scene, surface, model.maps(layer))
-            flat = render_image(drawn, batch, SAMPLES, SAMPLES**-0.5)
+            flat = render_image(model.drawn(), batch, SAMPLES, SAMPLES**-0.5)
         pixels = np.array(flat).reshape(-1, 4).astype(np.float64)
         return pixels[:, :3] + (1 - pixels[:, 3:]) * behind
 
-    brighter = start.reshape(-1, model.codec.packed) * np.float32(0.9)
+    brighter = start.reshape(-1, codec.packed) * np.float32(0.9)
     target = image(brighter.ravel())
     rgba = np.ones((len(target), 4), np.float32)
     rgba[:, :3] = target
@@ -120,7 +120,7 @@ def measure(scene: str, size: int, resolution: int) -> list[str]:
     )
     lines = []
     for channel in CHANNELS:
-        fields = smooth_texel_fields(model.codec, channel, FIELDS)
+        fields = smooth_texel_fields(codec, channel, FIELDS)
         truth = np.zeros(FIELDS)
         for k, field in enumerate(fields):
             values = [

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     import mitsuba as mi
 
     from appearance_opt.fit.checkpoint import FitState
-    from appearance_opt.fit.model import Model
+    from appearance_opt.latent.latent import Latent
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class Recorder:
         self._kept: FitState | None = None
         self._stopped = False
 
-    def restore(self, model: Model, state: FitState) -> bool:
+    def restore(self, model: Latent, state: FitState) -> bool:
         """Called before the clock of a fit starts: go on where the last one was stopped, if there
         was one."""
         self._began = time.perf_counter()
@@ -61,7 +61,7 @@ class Recorder:
             self._times and now >= self._times[0]
         )
 
-    def save(self, model: Model, state: FitState) -> None:
+    def save(self, model: Latent, state: FitState) -> None:
         """Remember the state. Raises KeyboardInterrupt when the fit is to be stopped here."""
         if self._stopped:
             return
@@ -77,6 +77,6 @@ class Blind:
     """Stands where the loop expects a ``Validation``: the loop's own looks would cost time here,
     and are not needed."""
 
-    def psnr(self, model: Model) -> float:
+    def psnr(self, model: Latent) -> float:
         """No opinion."""
         return 0.0

@@ -11,8 +11,10 @@ import drjit as dr
 import numpy as np
 
 from appearance_opt.fit.loop import FitOptions, fit
-from appearance_opt.fit.model import Model, Rates
 from appearance_opt.fit.validation import Validation
+from appearance_opt.latent.build import latent_of
+from appearance_opt.latent.parameter import Rates
+from appearance_opt.latent.positions import Positions
 from appearance_opt.reference.pool import ReferencePool
 from appearance_opt.stages.fitting import VALIDATION_VIEWS, fit_policy
 from appearance_opt.views import VALIDATION
@@ -83,7 +85,7 @@ class Run:
     def measured(self, averaged: bool = True) -> list[Point]:
         """The start and every snapshot: the running means of the parameters, or their last
         values."""
-        model = Model(self.start.mesh, self.start.maps, PARTS, Rates())
+        model = latent_of(self.start.mesh, self.start.maps, PARTS, Rates())
         points = [Point(0.0, 0, self.bench.measure_start(self.which, model))]
         for s in self.snapshots:
             model.restore(s.means if averaged else s.values)
@@ -122,9 +124,11 @@ def _fit(
     seconds: float | None = None,
 ) -> None:
     """A fit of a fresh model, or one gone on with by the recorder, at one resolution."""
-    model = Model(start.mesh, start.maps, PARTS, _scaled(setup.rates, setup.rate_factor))
+    model = latent_of(start.mesh, start.maps, PARTS, _scaled(setup.rates, setup.rate_factor))
     if setup.smoothing:
-        model.precondition(setup.smoothing, setup.smooth_rate * setup.rate_factor)
+        positions = model.fitted(Positions)
+        assert positions is not None
+        positions.precondition(setup.smoothing, setup.smooth_rate * setup.rate_factor)
     sampler = replace(bench.sampler, seed=setup.seed)
     width = setup.width(resolution)
     pool = ReferencePool(
@@ -148,7 +152,7 @@ def _fit(
 def _rates(bench: Bench, start: Start) -> Rates:
     """The product's rule: from how good the start is."""
     views = bench.sampler.held_out(VALIDATION).draw(0, VALIDATION_VIEWS)
-    model = Model(start.mesh, start.maps, frozenset(), Rates())
+    model = latent_of(start.mesh, start.maps, frozenset(), Rates())
     return fit_policy(Validation(bench.reference, views, 256).psnr(model), start.relative)[1]
 
 

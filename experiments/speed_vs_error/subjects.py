@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
     from appearance_opt.asset.types import Asset
     from appearance_opt.evaluate.metrics import Metrics
-    from appearance_opt.fit.model import Model
+    from appearance_opt.latent.latent import Latent
 
 OUT = common.OUT / "speed_vs_error"
 
@@ -105,11 +105,11 @@ class Bench:
             )
         return self._starts[texture]
 
-    def measure(self, model: Model) -> Metrics:
+    def measure(self, model: Latent) -> Metrics:
         """A model in the held-out views."""
         return compare_images(self.images, self._camera.render(model))
 
-    def measure_start(self, which: tuple[int, bool], model: Model) -> Metrics:
+    def measure_start(self, which: tuple[int, bool], model: Latent) -> Metrics:
         """The same for a start, once for each of those that ``which`` tells apart."""
         if which not in self._measured:
             self._measured[which] = self.measure(model)
