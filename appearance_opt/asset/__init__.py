@@ -30,6 +30,7 @@ def load(
     crease_angle: float | None = None,
     keep_layout: bool = False,
     mend: bool = True,
+    keep_rig: bool = False,
 ) -> Asset:
     """Read an asset; the suffix chooses the format. Units become metres, the up axis +Y.
 
@@ -42,7 +43,8 @@ def load(
     the normals of two faces above which the edge between them is hard; None: 40, and more where the
     surface is noisy. ``keep_layout``: for a mesh to be baked onto, whose vertices and texture
     coordinates stay as the file has them: no transform of a texture is applied to them, and
-    vertices of a mesh without normals are not split at hard edges. Harmless faults are repaired and
+    vertices of a mesh without normals are not split at hard edges. ``keep_rig``: with what moves
+    the meshes (``Asset.rig``), these in its bind space instead of at rest. Harmless faults are repaired and
     noted in ``Asset.notes``, unless ``mend`` is off. Raises InputError for everything else, naming
     the file.
     """
@@ -69,7 +71,7 @@ def load(
     with reading(path), np.errstate(over="ignore", invalid="ignore"):
         companions = Companions(missing_textures, None if root is None else Path(root))
         asset = with_text_names(
-            _read(path, suffix, refine, variants, companions, keep_layout, crease_angle)
+            _read(path, suffix, refine, variants, companions, keep_layout, crease_angle, keep_rig)
         )
         asset = replace(asset, files=(path.resolve(), *dict.fromkeys(companions.files)))
         return repair(asset, str(path)) if mend else asset
@@ -83,11 +85,12 @@ def _read(
     companions: Companions,
     keep_layout: bool,
     crease_angle: float | None,
+    keep_rig: bool,
 ) -> Asset:
     if suffix in (".glb", ".gltf"):
         from appearance_opt.asset.gltf_read import load_gltf
 
-        return load_gltf(path, companions, keep_layout, _name_of_variant(variants, path))
+        return load_gltf(path, companions, keep_layout, _name_of_variant(variants, path), keep_rig)
     if variants and suffix in (".obj", ".ply", ".stl"):
         raise InputError(f"{path}: {suffix} files have no variants; leave --variant out")
     if suffix == ".obj":
@@ -104,7 +107,7 @@ def _read(
         return load_stl(path, keep_layout, crease_angle)
     from appearance_opt.asset.usd_read import load_usd
 
-    return load_usd(path, refine, variants, companions, keep_layout)
+    return load_usd(path, refine, variants, companions, keep_layout, keep_rig)
 
 
 def _name_of_variant(variants: dict[str, str] | None, path: Path) -> str | None:

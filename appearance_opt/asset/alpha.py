@@ -180,9 +180,7 @@ def _only(mesh: Mesh, chosen: NDArray[np.bool_]) -> Mesh:
     if chosen.all():
         return mesh
     used, index = np.unique(mesh.faces[chosen], return_inverse=True)
-    attributes = ("positions", "normals", "uvs", "tangents", "colors")
-    kept = {a: getattr(mesh, a)[used] for a in attributes if getattr(mesh, a) is not None}
-    return replace(mesh, faces=index.reshape(-1, 3).astype(np.int32), **kept)
+    return mesh.take(used, index.reshape(-1, 3))
 
 
 def list_names(names: Iterable[str]) -> str:

@@ -106,6 +106,7 @@ class Batch:
             changed |= {
                 name: None if values is None else values[start:end] for name, values in new.items()
             }
+            changed["skin"] = None if mesh.skin is None else mesh.skin.take(rows)
             changed["faces"] = (corners[first_face:last_face] - start).astype(np.int32)
             out.append(replace(mesh, **changed))
             start, first_face = end, last_face

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,6 +13,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from appearance_opt.asset.file_options import FileOptions
+    from appearance_opt.asset.rig import Skin
     from appearance_opt.asset.types import Mesh
 
 QUANTIZATION, MESHOPT = "KHR_mesh_quantization", "EXT_meshopt_compression"
@@ -26,6 +26,10 @@ _COMPONENTS = {
     np.dtype(np.uint32): 5125,
     np.dtype(np.float32): 5126,
 }
+_SHAPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
+_SET = 4
+"""Influences in one pair of JOINTS_n and WEIGHTS_n."""
+
 _LARGEST = 65535
 """The largest index of 16 bits, which is reserved (primitive restart)."""
 
@@ -74,7 +78,36 @@ class Buffers:
             if values is not None:
                 integers = normalized(values) if self._quantized else None
                 attributes[name] = self._attribute(values if integers is None else integers)
+        if mesh.skin is not None:
+            attributes |= self._influences(mesh.skin)
         return {"attributes": attributes, "indices": self._indices(mesh)}
+
+    def _influences(self, skin: Skin) -> dict[str, int]:
+        """Joints and weights in sets of four; the bones of ``skin`` are joints of the file's."""
+        joints = np.where(skin.weights > 0, skin.bones, 0)
+        weights = skin.weights / skin.weights.sum(axis=1, keepdims=True)
+        missing = -joints.shape[1] % _SET
+        joints, weights = (np.pad(v, ((0, 0), (0, missing))) for v in (joints, weights))
+        kind = np.uint8 if joints.max(initial=0) < 256 else np.uint16
+        found = {}
+        for k in range(joints.shape[1] // _SET):
+            part = slice(_SET * k, _SET * k + _SET)
+            index = self._attribute(joints[:, part].astype(kind))
+            del self.accessors[index]["normalized"]
+            found[f"JOINTS_{k}"] = index
+            found[f"WEIGHTS_{k}"] = self._attribute(weights[:, part])
+        return found
+
+    def add_numbers(self, values: NDArray, bounds: bool = False) -> int:
+        """Index of an accessor of (N, width) floats that are no attributes of vertices."""
+        values = np.ascontiguousarray(values, np.float32)
+        view = self._add({"buffer": 0, **self._placed(values.tobytes())})
+        shape = _SHAPES[values.shape[1]]
+        index = self._accessor(view, values.dtype, shape, len(values))
+        if bounds:
+            low, high = values.min(axis=0).tolist(), values.max(axis=0).tolist()
+            self.accessors[index] |= {"min": low, "max": high}
+        return index
 
     def _indices(self, mesh: Mesh) -> int:
         kind: type = np.uint16 if len(mesh.positions) < _LARGEST else np.uint32
@@ -192,18 +225,7 @@ def _ordered(mesh: Mesh) -> Mesh:
     indices, place, used = meshopt.reorder_mesh(faces, True, True)
     order = np.argsort(place, kind="stable")[:used]
 
-    def moved(values: NDArray | None) -> NDArray | None:
-        return None if values is None else values[order]
-
-    return replace(
-        mesh,
-        positions=mesh.positions[order],
-        faces=indices.reshape(-1, 3).astype(np.int32),
-        normals=moved(mesh.normals),
-        uvs=moved(mesh.uvs),
-        tangents=moved(mesh.tangents),
-        colors=moved(mesh.colors),
-    )
+    return mesh.take(order, indices.reshape(-1, 3))
 
 
 def _unit(v: NDArray) -> NDArray[np.float32]:

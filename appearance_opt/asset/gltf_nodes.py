@@ -8,7 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from appearance_opt.asset.influences import repair_influences
 from appearance_opt.asset.instances import Instances
+from appearance_opt.asset.posing import blend
+from appearance_opt.asset.transforms import compose
 from appearance_opt.errors import InputError
 
 if TYPE_CHECKING:
@@ -17,6 +20,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from appearance_opt.asset.gltf_accessors import Document
+    from appearance_opt.asset.rig import Skin
 
 INSTANCING = "EXT_mesh_gpu_instancing"
 
@@ -48,6 +52,10 @@ class Nodes:
     def roots(self) -> list[int]:
         """The nodes that are no one's children."""
         return [k for k in range(len(self.nodes)) if k not in self._parents]
+
+    def parent(self, index: int) -> int | None:
+        """The node that a node is a child of; None at the top."""
+        return self._parents.get(index)
 
     def visits(self, roots: Iterable[int]) -> int:
         """How many nodes a walk from ``roots`` meets. glTF asks for trees (2.0, 3.5.2); where nodes
@@ -102,38 +110,55 @@ class Nodes:
         )
         return Instances(world @ compose(*each))
 
-    def skinned(
-        self, skin: int, attributes: dict[str, Any], read: Callable[[str], NDArray]
-    ) -> Instances:
-        """Where the vertices of a skinned primitive are at rest (glTF 2.0, 3.7.3): the sum of
-        weight * world of the joint * inverse bind matrix. The transform of the mesh's own node does
-        not count. ``read``: an attribute."""
-        joints = self._rest(skin)
+    def influences(
+        self, skin: int, attributes: dict[str, Any], read: Callable[[str], NDArray], name: str
+    ) -> Skin:
+        """How the vertices of a skinned primitive follow the joints of a skin; ``read``: an
+        attribute; ``name``: of the mesh, for notes."""
         sets = [
             k
             for k in range(len(attributes))
             if f"JOINTS_{k}" in attributes and f"WEIGHTS_{k}" in attributes
         ]
-        index = np.concatenate([read(f"JOINTS_{k}") for k in sets], axis=1).astype(np.int64)
-        weights = np.concatenate([read(f"WEIGHTS_{k}") for k in sets], axis=1).astype(np.float64)
-        weights[~np.any(weights, axis=1), 0] = (
-            1.0  # a vertex without weights follows its first joint
+        if not sets:
+            raise InputError(
+                f"{self.path}, mesh '{name}': it has JOINTS_0 without WEIGHTS_0; export it again"
+            )
+        return repair_influences(
+            np.concatenate([read(f"JOINTS_{k}") for k in sets], axis=1),
+            np.concatenate([read(f"WEIGHTS_{k}") for k in sets], axis=1),
+            len(self.document.items("skins")[skin]["joints"]),
+            name,
+            str(self.path),
+            self.document.companions.note,
         )
-        weights /= weights.sum(axis=1, keepdims=True)
-        blended = np.zeros((len(index), 4, 4))
-        for k in range(index.shape[1]):
-            blended += weights[:, k, None, None] * joints[index[:, k]]
-        return Instances(blended, skinned=True)
+
+    def skinned(self, skin: int, influences: Skin) -> Instances:
+        """Where the vertices of a skinned primitive are at rest (glTF 2.0, 3.7.3): the sum of
+        weight * world of the joint * inverse bind matrix. The transform of the mesh's own node does
+        not count."""
+        return Instances(blend(influences, self._rest(skin)), skinned=True)
+
+    def inverse_bind(self, skin: int) -> NDArray[np.float64]:
+        """(J, 4, 4) inverse bind matrices of a skin; identities where it has none."""
+        given = self.document.items("skins")[skin]
+        count = len(given["joints"])
+        if "inverseBindMatrices" not in given:
+            return np.broadcast_to(np.eye(4), (count, 4, 4))
+        flat = self.document.accessor(given["inverseBindMatrices"]).astype(np.float64)
+        if len(flat) < count:
+            raise InputError(
+                f"{self.path}: skin {skin} has {len(flat)} inverse bind matrices for {count} joints; "
+                "export it again"
+            )
+        return flat.reshape(-1, 4, 4).transpose(0, 2, 1)[:count]
 
     def _rest(self, skin: int) -> NDArray[np.float64]:
         """(J, 4, 4) world of the joint * inverse bind matrix, for each joint of a skin."""
         if skin not in self._joints:
             given = self.document.items("skins")[skin]
-            joints = np.stack([self.world(j) for j in given["joints"]])
-            if "inverseBindMatrices" in given:
-                inverse = self.document.accessor(given["inverseBindMatrices"]).astype(np.float64)
-                joints = joints @ inverse.reshape(-1, 4, 4).transpose(0, 2, 1)[: len(joints)]
-            self._joints[skin] = joints
+            worlds = np.stack([self.world(j) for j in given["joints"]])
+            self._joints[skin] = worlds @ self.inverse_bind(skin)
         return self._joints[skin]
 
 
@@ -143,19 +168,3 @@ _TRANSFORM = {
     "scale": (1.0, 1.0, 1.0),
 }
 """What a node or an instance may say of its place, and what it means to leave it out."""
-
-
-def compose(translation: NDArray, rotation: NDArray, scale: NDArray) -> NDArray[np.float64]:
-    """(N, 4, 4) translation (N, 3) * rotation, unit quaternion (N, 4) as (x, y, z, w), * scale (N,
-    3)."""
-    x, y, z, w = np.asarray(rotation, np.float64).T
-    out = np.zeros((len(x), 4, 4))
-    turn = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-    ]
-    out[:, :3, :3] = np.moveaxis(np.array(turn), 2, 0) * np.asarray(scale, np.float64)[:, None]
-    out[:, :3, 3] = translation
-    out[:, 3, 3] = 1.0
-    return out

@@ -3,26 +3,30 @@
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from appearance_opt.asset import uv_transforms
+from appearance_opt.asset.alpha import list_names
 from appearance_opt.asset.batch import Batch, in_range, replace_chosen
 from appearance_opt.asset.gltf_accessors import Document
 from appearance_opt.asset.gltf_draco import DRACO, Compressed
 from appearance_opt.asset.gltf_materials import READ_EXTENSIONS, VARIANTS, MaterialReader
 from appearance_opt.asset.gltf_meshopt import MESHOPT
 from appearance_opt.asset.gltf_nodes import INSTANCING, Nodes
+from appearance_opt.asset.gltf_rig import RigReader
+from appearance_opt.asset.influences import on_bone
 from appearance_opt.asset.instances import place_copies
 from appearance_opt.asset.normals import unit
-from appearance_opt.asset.origin import settle
+from appearance_opt.asset.origin import ZERO, settle
 from appearance_opt.asset.types import Asset, Contents, Mesh
 from appearance_opt.errors import InputError
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
 
     from numpy.typing import NDArray
 
@@ -41,25 +45,33 @@ materials, and lights. They are ignored with a note even where a file calls them
 
 
 def load_gltf(
-    path: Path, companions: Companions, keep_layout: bool = False, variant: str | None = None
+    path: Path,
+    companions: Companions,
+    keep_layout: bool = False,
+    variant: str | None = None,
+    keep_rig: bool = False,
 ) -> Asset:
-    """Read a .gltf or .glb file. ``keep_layout``: see ``asset.load``; ``variant``: name of a
-    KHR_materials_variants variant. Raises InputError."""
+    """Read a .gltf or .glb file. ``keep_layout``, ``keep_rig``: see ``asset.load``; ``variant``:
+    name of a KHR_materials_variants variant. Raises InputError."""
     document = Document(path, companions)
     for item in (*document.items("buffers"), *document.items("images")):
         uri = item.get("uri")
         if isinstance(uri, str) and not uri.startswith("data:"):
             companions.mention(uri, path, percent_encoded=True)
-    return _Reader(document, keep_layout, variant).asset()
+    return _Reader(document, keep_layout, variant, keep_rig).asset()
 
 
 class _Reader:
-    def __init__(self, document: Document, keep_layout: bool, variant: str | None) -> None:
+    def __init__(
+        self, document: Document, keep_layout: bool, variant: str | None, keep_rig: bool
+    ) -> None:
         self.document, self.keep_layout = document, keep_layout
         self.path = document.path
         self.note = document.companions.note
         self.materials = MaterialReader(document, variant)
         self.nodes = Nodes(document)
+        self.keep_rig = keep_rig
+        self.rig: RigReader | None = None
         primitives = [p for mesh in document.items("meshes") for p in mesh.get("primitives", [])]
         self._sharers = Counter(p.get("attributes", {}).get("POSITION") for p in primitives)
         self._uses = Counter(node["mesh"] for node in document.items("nodes") if "mesh" in node)
@@ -67,23 +79,33 @@ class _Reader:
 
     def asset(self) -> Asset:
         self._check_extensions()
-        meshes: list[Mesh] = []
         roots = self._roots()
         self.document.companions.budget.take(self.nodes.visits(roots), "nodes", self.path)
-        for root in roots:
-            self._visit(root, np.eye(4), meshes)
-        for kind, what in (
-            ("skins", "skins: the rest pose is kept, skinning dropped"),
-            ("animations", "animations dropped"),
-        ):
-            if self.document.items(kind):
-                self.note(what)
-        meshes, origin = settle(meshes, self.note)
+        if self.keep_rig and (self.document.items("skins") or self.document.items("animations")):
+            self.rig = RigReader(self.nodes, roots)
+        drawn = [place for root in roots for place in self._drawn(root, np.eye(4))]
+        parts = {k: self._primitives(*drawn[k]) for k in self._order(drawn)}
+        meshes = [mesh for k in range(len(drawn)) for mesh in parts[k]]
+        rig = None if self.rig is None else self.rig.rig()
+        if not self.keep_rig:
+            for kind, what in (
+                ("skins", "skins: the rest pose is kept, skinning dropped"),
+                ("animations", "animations dropped"),
+            ):
+                if self.document.items(kind):
+                    self.note(what)
+        origin = ZERO
+        if rig is None:
+            meshes, origin = settle(meshes, self.note)
+        else:
+            meshes = [replace(m, positions=m.positions.astype(np.float32)) for m in meshes]
         if not self.keep_layout:
             meshes = self._flat_where_needed(meshes)
         meshes = self.materials.apply_uv_transforms(meshes, self.keep_layout)
         notes = self.document.companions.notes.lines()
-        return Asset(tuple(meshes), self.path.stem, notes, origin=origin, contents=self._contents())
+        return Asset(
+            tuple(meshes), self.path.stem, notes, origin=origin, contents=self._contents(), rig=rig
+        )
 
     def _contents(self) -> Contents:
         def names(items: list[dict[str, Any]], kind: str) -> tuple[str, ...]:
@@ -94,6 +116,7 @@ class _Reader:
             names(self.document.items("skins"), "skin"),
             names(self.document.items("animations"), "animation"),
             names(variants, "variant"),
+            tuple(dict.fromkeys(t for m in self.document.items("meshes") for t in _targets(m))),
         )
 
     def _roots(self) -> list[int]:
@@ -119,26 +142,53 @@ class _Reader:
             if name not in _READ:
                 self.note(f"extension {name} ignored")
 
-    def _visit(self, index: int, parent: NDArray, meshes: list[Mesh]) -> None:
+    def _drawn(self, index: int, parent: NDArray) -> Iterator[tuple[int, NDArray]]:
+        """(node, its transform to the world) of a node and those below it that have a mesh."""
         node = self.document.items("nodes")[index]
         world = parent @ self.nodes.local[index]
         if "mesh" in node:
-            mesh = self.document.items("meshes")[node["mesh"]]
-            name = node.get("name") or mesh.get("name") or f"mesh{node['mesh']}"
-            for k, primitive in enumerate(mesh["primitives"]):
-                weights = node.get("weights", mesh.get("weights", ()))
-                found = self._primitive(
-                    primitive, k, node, world, name if k == 0 else f"{name}.{k}", weights
-                )
-                meshes += [] if found is None else [found]
+            yield index, world
         for child in node.get("children", []):
-            self._visit(child, world, meshes)
+            yield from self._drawn(child, world)
+
+    def _order(self, drawn: list[tuple[int, NDArray]]) -> list[int]:
+        """In which order meshes are read: with a rig, skinned ones first, which say where the
+        bind space is."""
+        nodes, order = self.document.items("nodes"), list(range(len(drawn)))
+        return (
+            order
+            if self.rig is None
+            else sorted(order, key=lambda k: "skin" not in nodes[drawn[k][0]])
+        )
+
+    def _primitives(self, index: int, world: NDArray) -> list[Mesh]:
+        """The triangles of a node's mesh at every place at which the node puts them."""
+        node = self.document.items("nodes")[index]
+        mesh = self.document.items("meshes")[node["mesh"]]
+        name = node.get("name") or mesh.get("name") or f"mesh{node['mesh']}"
+        weights = node.get("weights", mesh.get("weights", ()))
+        if any(p.get("targets") for p in mesh["primitives"]):
+            self._mention_targets(mesh, name)
+        found = [
+            self._primitive(p, k, index, world, name if k == 0 else f"{name}.{k}", weights)
+            for k, p in enumerate(mesh["primitives"])
+        ]
+        return [m for m in found if m is not None]
+
+    def _mention_targets(self, mesh: dict[str, Any], name: str) -> None:
+        """Note the morph targets of a mesh by the names that exporters give them."""
+        told = "morph targets: the shape of their default weights is kept, others are dropped"
+        names = _targets(mesh)
+        if self.rig is None:
+            self.note(told)
+        else:
+            self.note(f"mesh '{name}': {told} ({list_names(names)})")
 
     def _primitive(
         self,
         primitive: dict[str, Any],
         k: int,
-        node: dict[str, Any],
+        index: int,
         world: NDArray,
         name: str,
         weights: Sequence[float],
@@ -148,14 +198,15 @@ class _Reader:
         if primitive.get("mode", 4) not in (4, 5, 6):
             self.note("points and lines ignored")
             return None
-        if primitive.get("targets"):
-            self.note(
-                "morph targets: the shape of their default weights is kept, others are dropped"
-            )
+        node = self.document.items("nodes")[index]
         if "skin" in node and "JOINTS_0" in primitive["attributes"]:
             source = _Source(self.document, primitive, weights)
-            place = self.nodes.skinned(node["skin"], primitive["attributes"], source.read)
-            return place_copies(self._read(primitive, source), place, name)
+            skin = self.nodes.influences(node["skin"], primitive["attributes"], source.read, name)
+            mesh = self._read(primitive, source)
+            if self.rig is None:
+                return place_copies(mesh, self.nodes.skinned(node["skin"], skin), name)
+            place, skin = self.rig.skinned(node["skin"], skin, name)
+            return replace(place_copies(mesh, place, name), skin=skin)
         key = (node["mesh"], k, tuple(weights))
         local = self._local.get(key)
         if local is None:
@@ -174,7 +225,13 @@ class _Reader:
                 "the thickness of transmissive materials is not scaled with the nodes of their meshes"
             )
         self.document.companions.budget.take_copies(local, place.copies, self.path)
-        return place_copies(local, place, name)
+        bone = None
+        if self.rig is not None:
+            place, bone = self.rig.rigid(index, place, world)
+        placed = place_copies(local, place, name)
+        return (
+            placed if bone is None else replace(placed, skin=on_bone(bone, len(placed.positions)))
+        )
 
     def _read(self, primitive: dict[str, Any], source: _Source) -> Mesh:
         """A primitive in its own coordinates, in double precision."""
@@ -264,6 +321,15 @@ class _Source:
                 )
             out[:, : moved.shape[1]] += float(weight) * moved
         return out
+
+
+def _targets(mesh: dict[str, Any]) -> list[str]:
+    """Names of the morph targets of a mesh, where exporters write them, or numbers."""
+    count = max((len(p.get("targets", ())) for p in mesh["primitives"]), default=0)
+    extras = mesh.get("extras")
+    named = extras.get("targetNames", []) if isinstance(extras, dict) else []
+    names = list(map(str, named))[:count] if isinstance(named, list) else []
+    return names + [f"target{k}" for k in range(len(names), count)]
 
 
 def flat_normals(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import struct
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
@@ -23,6 +23,7 @@ from appearance_opt.asset.gltf_materials import (
     VOLUME,
     WEBP,
 )
+from appearance_opt.asset.gltf_rig_write import RigWriter
 from appearance_opt.asset.height import as_16_bit, height_png
 from appearance_opt.asset.hierarchy import Transform
 from appearance_opt.asset.quantize import Grid
@@ -77,7 +78,10 @@ class _Writer:
         self._materials: dict[int, int] = {}
         self._looks: set[tuple] = set()
         self.json: dict[str, Any] = {"asset": _about(asset), "scene": 0, "meshes": []}
-        self._place(asset)
+        if asset.rig is None:
+            self._place(asset)
+        else:
+            self._place_rigged(RigWriter(asset, asset.rig))
         self.images = encode_all(self._slots, options)
         self._name_images()
 
@@ -146,6 +150,23 @@ class _Writer:
             nodes.append(root)
             beside = [len(nodes) - 1]
         self.json["scenes"] = [{"nodes": tops + beside}]
+
+    def _place_rigged(self, rig: RigWriter) -> None:
+        """Scene, nodes, skins, animations and meshes of an asset that moves."""
+        skinned, hung, still = rig.parts
+        for mesh in hung:
+            parent, node = rig.nodes[rig.node_of(mesh)], {"name": mesh.name}
+            parent.setdefault("children", []).append(len(rig.nodes))
+            rig.nodes.append(
+                node | self._shown([replace(mesh, skin=None)], mesh.name, self._grid([mesh]))
+            )
+        grid = self._grid(still)
+        rig.nodes += [{"name": m.name, **self._shown([m], m.name, grid)} for m in still]
+        grid = self._grid(skinned)
+        for mesh in skinned:  # their own place does not count
+            shown = self._shown([mesh], mesh.name, grid)["mesh"]
+            rig.nodes.append({"name": mesh.name, "mesh": shown, "skin": 0})
+        self.json |= rig.finish(self.buffers, grid)
 
     def _hang(self, meshes: list[Mesh], node: dict[str, Any], nodes: list[dict[str, Any]]) -> None:
         """Let a node show meshes in its coordinates. What undoes a grid gets a node of its own

@@ -14,12 +14,14 @@ Loaders convert what they read to these conventions; savers convert back.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+
+from appearance_opt.asset.rig import Rig, Skin
 
 ColorSpace = Literal["srgb", "linear"]
 Wrap = Literal["repeat", "clamp", "mirror"]
@@ -138,6 +140,7 @@ class Mesh:
     the file); ``uvs`` (V, 2) or None; ``tangents`` (V, 4) or None; ``colors`` (V, 3) linear vertex
     colours, (V, 4) with alpha, or None. Vertices are split at UV and normal seams, as in the file.
     ``node``: number of the asset's node to which it belongs, None for none.
+    With a ``skin`` it is in the bind space of the asset's rig instead of world space.
     """
 
     positions: NDArray[np.float32]
@@ -149,6 +152,14 @@ class Mesh:
     material: Material = field(default_factory=Material)
     name: str = "mesh"
     node: int | None = None
+    skin: Skin | None = None
+
+    def take(self, vertices: NDArray, faces: NDArray) -> Mesh:
+        """The mesh with some of its vertices, in any order, and ``faces`` (F, 3) among them."""
+        names = ("positions", "normals", "uvs", "tangents", "colors")
+        kept = {n: values[vertices] for n in names if (values := getattr(self, n)) is not None}
+        skin = None if self.skin is None else self.skin.take(vertices)
+        return replace(self, faces=faces.astype(np.int32), skin=skin, **kept)
 
 
 @dataclass(frozen=True)
@@ -175,12 +186,13 @@ class Credits:
 
 @dataclass(frozen=True)
 class Contents:
-    """Names of what a file holds beside its surfaces, and no job here uses: ``skins`` (in USD
-    skeletons), ``clips`` of animation, ``variants`` as ``--variant`` takes them."""
+    """Names of what a file holds beside its surfaces: ``skins`` (in USD skeletons), ``clips`` of
+    animation, ``variants`` as ``--variant`` takes them, ``morph_targets`` (in USD blend shapes)."""
 
     skins: tuple[str, ...] = ()
     clips: tuple[str, ...] = ()
     variants: tuple[str, ...] = ()
+    morph_targets: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -190,7 +202,8 @@ class Asset:
     ``origin``: the place of the meshes in the world, which is origin + positions (metres, double
     precision), zero but for what lies far away for its size; ``nodes``, a parent before its
     children: the hierarchy of the meshes, whose transforms are applied already, empty for one mesh
-    beside the other."""
+    beside the other; ``rig``: what moves the meshes that have a skin, with a hierarchy of its own,
+    None for what stands still."""
 
     meshes: tuple[Mesh, ...]
     name: str = "asset"
@@ -200,6 +213,7 @@ class Asset:
     contents: Contents = field(default_factory=Contents)
     nodes: tuple[Node, ...] = ()
     credits: Credits = field(default_factory=Credits)
+    rig: Rig | None = None
 
     @property
     def triangle_count(self) -> int:

@@ -221,15 +221,4 @@ def _part(mesh: Mesh, chosen: NDArray) -> Mesh:
         faces,
     )
 
-    def of(values: NDArray | None) -> NDArray | None:
-        return None if values is None else values[inside]
-
-    return replace(
-        mesh,
-        positions=mesh.positions[inside],
-        faces=faces.astype(np.int32),
-        normals=of(mesh.normals),
-        uvs=of(mesh.uvs),
-        tangents=of(mesh.tangents),
-        colors=of(mesh.colors),
-    )
+    return mesh.take(inside, faces)

@@ -40,6 +40,13 @@ def blend_shapes(
     return np.array(moved, np.float64), turned
 
 
+def shape_names(prim: Any) -> list[str]:
+    """Names of the blend shapes of a mesh."""
+    from pxr import UsdSkel
+
+    return [str(name) for name in UsdSkel.BindingAPI(prim).GetBlendShapesAttr().Get() or []]
+
+
 def _weights(binding: Any) -> dict[str, float]:
     """Default weights by the names of blend shapes."""
     from pxr import Usd, UsdSkel

@@ -11,27 +11,30 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from appearance_opt.asset import usd_shapes, uv_transforms
-from appearance_opt.asset.alpha import OPAQUE
+from appearance_opt.asset.alpha import OPAQUE, list_names
 from appearance_opt.asset.batch import fill_normals
 from appearance_opt.asset.companions import Companions
 from appearance_opt.asset.instances import Instances, place_copies
 from appearance_opt.asset.normals import accumulate, unit
 from appearance_opt.asset.notes import Notes
-from appearance_opt.asset.origin import settle
+from appearance_opt.asset.origin import ZERO, settle
 from appearance_opt.asset.paths import check_inside, common_folder, read_bytes
 from appearance_opt.asset.polygons import Polygons, triangulate
 from appearance_opt.asset.rows import rank_rows, unique_rows
 from appearance_opt.asset.subdivide import Sharpness, catmull_clark
 from appearance_opt.asset.types import Asset, Contents, Mesh
-from appearance_opt.asset.usd_blend import blend_shapes
+from appearance_opt.asset.usd_blend import blend_shapes, shape_names
 from appearance_opt.asset.usd_guard import check_usd
 from appearance_opt.asset.usd_materials import MaterialReader
+from appearance_opt.asset.usd_rig import RigReader, dense, refined_influences
 from appearance_opt.errors import InputError
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from numpy.typing import NDArray
+
+    from appearance_opt.asset.rig import Skin
 
 _TO_Y_UP = {
     "Y": np.eye(3),
@@ -56,10 +59,11 @@ def load_usd(
     variants: dict[str, str] | None = None,
     companions: Companions | None = None,
     keep_layout: bool = False,
+    keep_rig: bool = False,
 ) -> Asset:
     """Read a stage at its earliest time, variants at their selection (or as ``variants`` says: set
     name -> variant, on the default prim). Catmull-Clark and Loop meshes are refined ``refine``
-    times. ``keep_layout``: see ``asset.load``. Raises InputError."""
+    times. ``keep_layout``, ``keep_rig``: see ``asset.load``. Raises InputError."""
     from pxr import Tf, UsdUtils
 
     path = Path(path)
@@ -68,7 +72,7 @@ def load_usd(
     companions = companions or Companions()
     diagnostics = UsdUtils.CoalescingDiagnosticDelegate()
     try:
-        asset = _read_stage(path, refine, variants or {}, companions, keep_layout)
+        asset = _read_stage(path, refine, variants or {}, companions, keep_layout, keep_rig)
     except Tf.ErrorException as error:
         # the first of what went wrong: the place in the file, if it is text
         said = [
@@ -95,7 +99,12 @@ def load_usd(
 
 
 def _read_stage(
-    path: Path, refine: int, variants: dict[str, str], companions: Companions, keep_layout: bool
+    path: Path,
+    refine: int,
+    variants: dict[str, str],
+    companions: Companions,
+    keep_layout: bool,
+    keep_rig: bool,
 ) -> Asset:
     from pxr import Usd
 
@@ -105,7 +114,7 @@ def _read_stage(
     _select(stage, variants, path)
     _refuse_escapes(stage, path, companions)
     _mention_all(stage, path, companions)
-    return _Reader(stage, path, refine, companions, keep_layout).asset()
+    return _Reader(stage, path, refine, companions, keep_layout, keep_rig).asset()
 
 
 def _select(stage: Any, variants: dict[str, str], path: Path) -> None:
@@ -209,17 +218,25 @@ def _count_prims(stage: Any) -> int:
 class _Geometry:
     """A mesh in its own coordinates. ``values``: positions ("points") and other attributes by name,
     each with faces of its own; ``face_ids``: the file's face of each face; ``flipped``: do faces
-    turn clockwise? ``holes``: faces of the file that are not drawn."""
+    turn clockwise? ``holes``: faces of the file that are not drawn; ``skin``: influences of the
+    file's points, whose numbers are among the values as "skin", or, refined, weights."""
 
     values: dict[str, tuple[NDArray, Polygons]]
     face_ids: NDArray[np.int64]
     flipped: bool
     holes: NDArray[np.int64]
+    skin: Skin | None = None
 
 
 class _Reader:
     def __init__(
-        self, stage: Any, path: Path, refine: int, companions: Companions, keep_layout: bool
+        self,
+        stage: Any,
+        path: Path,
+        refine: int,
+        companions: Companions,
+        keep_layout: bool,
+        keep_rig: bool,
     ) -> None:
         from pxr import Usd, UsdGeom
 
@@ -231,6 +248,9 @@ class _Reader:
         self.time = Usd.TimeCode.EarliestTime()
         self.cache = UsdGeom.XformCache(self.time)
         self._read: dict[tuple[str, ...], list[Mesh]] = {}
+        self.rig = (
+            RigReader(stage, path, self.to_metres, self.time, self.note) if keep_rig else None
+        )
 
     def asset(self) -> Asset:
         from pxr import Usd, UsdGeom
@@ -243,20 +263,29 @@ class _Reader:
                 prims.PruneChildren()  # its prototypes are drawn where it says
                 meshes += self._instances(prim)
             elif prim.IsA(UsdGeom.Gprim) and self._shown(prim):
-                place = self._place([np.array(self._to_world(prim))])
-                meshes += [self._put(part, place) for part in self._parts(prim)]
+                meshes += [self._put_one(prim, part) for part in self._parts(prim)]
         meshes = self.materials.apply_uv_transforms(meshes, self.keep_layout)
-        meshes, origin = settle(meshes, self.note)
+        rig = None if self.rig is None else self.rig.rig()
+        origin = ZERO
+        if rig is None:
+            meshes, origin = settle(meshes, self.note)
+        else:
+            meshes = [replace(m, positions=m.positions.astype(np.float32)) for m in meshes]
         notes = self.companions.notes.lines()
-        return Asset(tuple(meshes), self.path.stem, notes, origin=origin, contents=self._contents())
+        return Asset(
+            tuple(meshes), self.path.stem, notes, origin=origin, contents=self._contents(), rig=rig
+        )
 
     def _contents(self) -> Contents:
         """Skeletons, animations of theirs or the frames of the stage, and the variants of the
         default prim."""
         found: dict[str, list[str]] = {"Skeleton": [], "SkelAnimation": []}
+        shapes: list[str] = []
         for prim in self.stage.Traverse():
             if prim.GetTypeName() in found:
                 found[prim.GetTypeName()].append(str(prim.GetName()))
+            elif prim.GetTypeName() == "Mesh":
+                shapes += shape_names(prim)
         clips, stage = found["SkelAnimation"], self.stage
         if (
             not clips
@@ -267,7 +296,12 @@ class _Reader:
         top = stage.GetDefaultPrim()
         sets = [top.GetVariantSet(name) for name in top.GetVariantSets().GetNames()] if top else []
         variants = [f"{s.GetName()}={choice}" for s in sets for choice in s.GetVariantNames()]
-        return Contents(tuple(found["Skeleton"]), tuple(clips), tuple(variants))
+        return Contents(
+            tuple(found["Skeleton"]),
+            tuple(clips),
+            tuple(variants),
+            tuple(dict.fromkeys(shapes)),
+        )
 
     def _to_world(self, prim: Any) -> Any:
         """From a mesh's own coordinates to the world. A skinned one is kept at its bind pose,
@@ -279,7 +313,8 @@ class _Reader:
         binding = UsdSkel.BindingAPI(prim)
         if not binding.GetJointIndicesPrimvar().HasValue():
             return world
-        self.note(f"'{prim.GetPath()}': the bind pose is kept, skinning dropped")
+        if self.rig is None:
+            self.note(f"'{prim.GetPath()}': the bind pose is kept, skinning dropped")
         skeleton = binding.GetInheritedSkeleton()
         bound = binding.GetGeomBindTransformAttr().Get(self.time)
         if not skeleton:
@@ -334,6 +369,15 @@ class _Reader:
                 meshes += [self._put(one, place) for one in fill_normals(self._parts(part))]
         return meshes
 
+    def _put_one(self, prim: Any, mesh: Mesh) -> Mesh:
+        """A mesh where its prim puts it in the world, or in bind space if there is a rig."""
+        if self.rig is None or mesh.skin is None:
+            placed = self._put(mesh, self._place([np.array(self._to_world(prim))]))
+            moved = None if self.rig is None else self.rig.rigid(prim, len(placed.positions))
+            return replace(placed, skin=moved)
+        place, skin = self.rig.place(prim, mesh.skin)
+        return replace(self._put(mesh, place), skin=skin)
+
     def _put(self, mesh: Mesh, place: Instances) -> Mesh:
         """A mesh at all its places."""
         self.companions.budget.take_copies(mesh, place.copies, self.path)
@@ -370,7 +414,8 @@ class _Reader:
         flipped = str(UsdGeom.Gprim(prim).GetOrientationAttr().Get()) == "leftHanded"
         if prim.IsA(UsdGeom.Mesh):
             holes = UsdGeom.Mesh(prim).GetHoleIndicesAttr().Get(self.time)
-            return _Geometry(*self._mesh(prim, flipped), flipped, np.array(holes or [], np.int64))
+            values, face_ids, skin = self._mesh(prim, flipped)
+            return _Geometry(values, face_ids, flipped, np.array(holes or [], np.int64), skin)
         found = usd_shapes.triangles(prim, self.time)
         if found is None:
             self.note(
@@ -388,9 +433,9 @@ class _Reader:
 
     def _mesh(
         self, prim: Any, flipped: bool
-    ) -> tuple[dict[str, tuple[NDArray, Polygons]], NDArray[np.int64]]:
-        """Attributes and the file's faces of a mesh, refined if it is a subdivision surface (see
-        ``_Geometry``).
+    ) -> tuple[dict[str, tuple[NDArray, Polygons]], NDArray[np.int64], Skin | None]:
+        """Attributes, the file's faces and the influences of a mesh, refined if it is a subdivision
+        surface (see ``_Geometry``).
 
         A polygonal mesh without normals "should be treated and rendered as faceted, with no attempt
         to compute smooth normals" (UsdGeomMesh, "A Note About Normals"), and so are bilinear
@@ -420,8 +465,14 @@ class _Reader:
         if shape is not None:
             points = shape[0]
             told = "blend shapes: the shape of their default weights is kept, others are dropped"
-            self.note(f"'{prim.GetPath()}': {told}")
+            names = "" if self.rig is None else f" ({list_names(shape_names(prim))})"
+            self.note(f"'{prim.GetPath()}': {told}{names}")
         values = {"points": (points, polygons)}
+        skin = None if self.rig is None else self.rig.influences(prim, len(points))
+        if skin is not None:  # the number of each point, or weights to be refined with it
+            rows = dense(skin) if refined > 1 else np.arange(float(len(points)))[:, None]
+            values["skin"] = rows, polygons
+            skin = skin if refined == 1 else None
         for name, (value, where) in self._primvars(prim, mesh, polygons).items():
             values[name] = (value, where)
         if shape is not None and "normals" in values and shape[1].any():
@@ -447,7 +498,7 @@ class _Reader:
                     values[name] = value, where
                     if name in sharpness:
                         sharpness[name] = left
-        return values, face_ids
+        return values, face_ids, skin
 
     def _sharpness(self, mesh: Any, vertices: int) -> Sharpness:
         """Creases and corners of a subdivision surface. Raises InputError if their numbers do not
@@ -566,6 +617,7 @@ class _Reader:
                 colors = np.concatenate([colors, got["opacity"]], axis=1)
             meshes.append(
                 Mesh(
+                    skin=_skin_of(geometry.skin, got.get("skin")),
                     positions=got["points"],
                     faces=index.reshape(-1, 3).astype(np.int32),
                     normals=got.get("normals"),
@@ -576,6 +628,14 @@ class _Reader:
                 )
             )
         return meshes
+
+
+def _skin_of(skin: Skin | None, told: NDArray | None) -> Skin | None:
+    """The influences of vertices: those of the points whose numbers (V, 1) are told, or what is
+    left of refined weights (V, J)."""
+    if told is None:
+        return None
+    return refined_influences(told) if skin is None else skin.take(told[:, 0].astype(np.int64))
 
 
 def _facets(points: NDArray, polygons: Polygons, flipped: bool) -> tuple[NDArray, Polygons]:

@@ -18,6 +18,7 @@ from appearance_opt.asset.paths import MAX_NAME
 from appearance_opt.asset.rows import unique_rows
 from appearance_opt.asset.sides import apart_from_sides
 from appearance_opt.asset.texture_files import Slot, TextureFile, encode, encode_pixels
+from appearance_opt.asset.usd_rig_write import RigWriter
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -56,18 +57,20 @@ def save_usd(asset: Asset, path: Path, options: FileOptions = PLAIN) -> None:
 
 
 def _write_stage(asset: Asset, root: Path, textures: str, options: FileOptions) -> None:
-    from pxr import Gf, Kind, Tf, Usd, UsdGeom
+    from pxr import Gf, Kind, Tf, Usd, UsdGeom, UsdSkel
 
     stage = Usd.Stage.CreateNew(str(root))
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
     name = Tf.MakeValidIdentifier(asset.name)
-    top = UsdGeom.Xform.Define(stage, f"/{name}")
+    kind = UsdGeom.Xform if asset.rig is None else UsdSkel.Root
+    top = kind.Define(stage, f"/{name}")
     stage.SetDefaultPrim(top.GetPrim())
     Usd.ModelAPI(top.GetPrim()).SetKind(Kind.Tokens.component)
     if any(asset.origin):
         top.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Vec3d(*asset.origin))
     UsdGeom.Scope.Define(stage, f"/{name}/Materials")
+    rig = None if asset.rig is None else RigWriter(stage, f"/{name}", asset, asset.rig)
     materials: dict[tuple[tuple, bool, bool], Any] = {}
     for k, mesh in enumerate(asset.meshes):
         key = (apart_from_sides(mesh.material), _colored(mesh), _veiled(mesh))
@@ -77,7 +80,8 @@ def _write_stage(asset: Asset, root: Path, textures: str, options: FileOptions) 
             preview = _Preview(stage, target, root.parent / textures, options)
             materials[key] = _material(preview, mesh.material, key[1], key[2])
         parent = _parent(stage, name, k, len(asset.meshes))
-        _mesh(stage, f"{parent}/G{k}_{Tf.MakeValidIdentifier(mesh.name)}", mesh, materials[key])
+        target = f"{parent}/G{k}_{Tf.MakeValidIdentifier(mesh.name)}"
+        _mesh(stage, target, mesh, materials[key], rig)
     stage.GetRootLayer().Save()
 
 
@@ -106,7 +110,7 @@ def _veiled(mesh: Mesh) -> bool:
     return coverage(mesh.material)[1] is None
 
 
-def _mesh(stage: Any, target: str, mesh: Mesh, material: Any) -> None:
+def _mesh(stage: Any, target: str, mesh: Mesh, material: Any, rig: RigWriter | None) -> None:
     from pxr import Sdf, UsdGeom, UsdShade, Vt
 
     out = UsdGeom.Mesh.Define(stage, target)
@@ -114,7 +118,10 @@ def _mesh(stage: Any, target: str, mesh: Mesh, material: Any) -> None:
     positions = np.ascontiguousarray(mesh.positions, np.float32)
     # vertices in one place are one point: editors take edges between points that are apart for a
     # rim
-    first, place = _distinct(positions)
+    kinds_of_points = [positions]
+    if mesh.skin is not None:
+        kinds_of_points += [mesh.skin.bones.astype(np.float32), mesh.skin.weights]
+    first, place = _distinct(np.concatenate(kinds_of_points, axis=1))
     points, corners = positions[first], place[mesh.faces.ravel()].astype(np.int32)
     out.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(points))
     out.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(mesh.faces), 3, np.int32)))
@@ -138,6 +145,8 @@ def _mesh(stage: Any, target: str, mesh: Mesh, material: Any) -> None:
         alpha = mesh.colors[:, 3:] * np.float32(coverage(mesh.material)[0])
         _add_primvar(out, "displayOpacity", kinds.FloatArray, alpha, mesh.faces)
     UsdShade.MaterialBindingAPI.Apply(out.GetPrim()).Bind(material)
+    if rig is not None and mesh.skin is not None:
+        rig.bind(out, mesh.skin, first)
 
 
 def _add_primvar(out: Any, name: str, kind: Any, values: NDArray, faces: NDArray) -> None:

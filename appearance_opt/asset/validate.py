@@ -352,9 +352,7 @@ def _repair_normals(mesh: Mesh, notes: Notes) -> Mesh:
 def _compact(mesh: Mesh, used: NDArray) -> Mesh:
     new = np.full(len(mesh.positions), -1, np.int32)
     new[used] = np.arange(len(used), dtype=np.int32)
-    attributes = ("positions", "normals", "uvs", "tangents", "colors")
-    kept = {a: getattr(mesh, a)[used] for a in attributes if getattr(mesh, a) is not None}
-    return replace(mesh, faces=new[mesh.faces], **kept)
+    return mesh.take(used, new[mesh.faces])
 
 
 def _degenerate(positions: NDArray, faces: NDArray) -> NDArray[np.bool_]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import textwrap
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,9 +24,10 @@ from appearance_opt.asset.alpha import (
 from appearance_opt.asset.types import Contents, Texture
 from appearance_opt.asset.validate import Validation, repair_and_count
 from appearance_opt.config import InspectOptions, resolve_options
+from appearance_opt.errors import InputError
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
     from appearance_opt.asset.types import Asset, Material, Mesh
 
@@ -72,12 +74,53 @@ class MaterialFacts:
 
 
 @dataclass(frozen=True)
+class ClipFacts:
+    """A clip: seconds, and different times at which it has keys."""
+
+    name: str
+    seconds: float
+    keys: int
+
+
+@dataclass(frozen=True)
+class RigFacts:
+    """``joints`` that move vertices; ``influences``: the most of a vertex, and those that vertices
+    have in the mean; ``rigid_meshes``: that move without a skin; ``rate``: frames per second;
+    ``fault``: why nothing of this can be used, or None."""
+
+    joints: int = 0
+    influences: int = 0
+    mean_influences: float = 0.0
+    rigid_meshes: int = 0
+    rate: float = 0.0
+    animations: tuple[ClipFacts, ...] = ()
+    fault: str | None = None
+
+    def lines(self) -> list[str]:
+        """The same for a terminal."""
+        if self.fault is not None:
+            return _wrap(f"{'rig':12}", f"cannot be used: {self.fault}")
+        out = _wrap(
+            f"{'rig':12}",
+            f"{_some(self.joints, 'joint')}, at most {_some(self.influences, 'influence')} per "
+            f"vertex ({self.mean_influences:.3g} in the mean), "
+            f"{_some(self.rigid_meshes, 'rigid mesh', 'rigid meshes')}, "
+            f"{self.rate:g} frames per second",
+        )
+        for clip in self.animations[:LISTED]:
+            out.append(f"  {clip.name:24}{clip.seconds:.4g} s, {_some(clip.keys, 'key')}")
+        if len(self.animations) > LISTED:
+            out.append(f"  ... and {len(self.animations) - LISTED:,} clips more")
+        return out
+
+
+@dataclass(frozen=True)
 class Inspection:
     """``size``: extent along x, y, z in metres; ``origin``: see ``Asset``; ``file_bytes``: of the
     ``files`` that the asset is made of; ``single_sided``: triangles that are fitted and seen from
     one side, and ``backs_in_sight`` those among them whose backs may come into sight (see
     ``asset.sides``); ``texture_bytes``: of their pixels as they are stored here, uncompressed,
-    without mip levels."""
+    without mip levels; ``rig``: of what is animated, else None."""
 
     name: str
     files: int
@@ -95,6 +138,7 @@ class Inspection:
     contents: Contents
     alpha: dict[str, Share]
     notes: tuple[str, ...]
+    rig: RigFacts | None = None
 
     def record(self) -> dict[str, Any]:
         """All of it for JSON, the counts and contents among the rest."""
@@ -112,8 +156,13 @@ class Inspection:
             f"sides       {self.single_sided:,} triangles single-sided, {self.backs_in_sight:,} with backs in sight",
             f"textures    {self.textures}, {_bytes(self.texture_bytes)} uncompressed",
         ]
-        for what, names in (("skins", self.contents.skins), ("clips", self.contents.clips)):
+        for what, names in (
+            ("skins", self.contents.skins),
+            ("clips", self.contents.clips),
+            ("morphs", self.contents.morph_targets),
+        ):
             out += _list_names(f"{what:12}", names, f"{len(names)}: ") if names else []
+        out += [] if self.rig is None else self.rig.lines()
         out += (
             _list_names(f"{'variants':12}", self.contents.variants)
             if self.contents.variants
@@ -156,7 +205,8 @@ def inspect(
     """What is in a file, and what is wrong with it. ``values``: options by flat key, as those of
     ``load``. Raises InputError."""
     reading = resolve_options(InspectOptions, options, values).asset.arguments()
-    given = load(source, mend=False, **{**reading, "variants": variants or reading["variants"]})
+    read = partial(load, source, **{**reading, "variants": variants or reading["variants"]})
+    given = read(mend=False)
     counts, asset = repair_and_count(given, str(source))
     low, high = asset.bounds()
     parts = separate_opaque(asset)
@@ -182,6 +232,28 @@ def inspect(
         contents=asset.contents,
         alpha=count_kinds(parts),
         notes=parts.notes,
+        rig=_rig(read) if asset.contents.skins or asset.contents.clips else None,
+    )
+
+
+def _rig(read: Callable[..., Asset]) -> RigFacts | None:
+    """Facts of what moves an asset, read again with it; None if nothing does."""
+    try:
+        asset = read(keep_rig=True)
+    except InputError as error:
+        return RigFacts(fault=str(error))
+    if asset.rig is None:
+        return None
+    skins = [m.skin for m in asset.meshes if m.skin is not None]
+    bones = {int(b) for s in skins for b in np.unique(s.bones[s.weights > 0])}
+    counts = np.concatenate([(s.weights > 0).sum(axis=1) for s in skins] or [np.zeros(1, np.int64)])
+    return RigFacts(
+        joints=len({int(asset.rig.bone_nodes[b]) for b in bones}),
+        influences=int(counts.max(initial=0)),
+        mean_influences=float(counts.mean()),
+        rigid_meshes=sum(s.rigid for s in skins),
+        rate=asset.rig.rate,
+        animations=tuple(ClipFacts(c.name, c.duration, c.keys) for c in asset.rig.clips),
     )
 
 
