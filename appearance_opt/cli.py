@@ -137,7 +137,7 @@ def simplify(
 def bake(
     given: Given,
     out: Out,
-    textures: Annotated[
+    loose: Annotated[
         Path | None,
         typer.Option(help="Folder for the maps as loose files.", rich_help_panel="Output"),
     ] = None,
@@ -148,7 +148,7 @@ def bake(
     """Bake what HIGH looks like into the maps of LOW, which keeps its shape."""
     folder = None if no_report else report or _report_of(out)
     spec = given.spec(out, config)
-    _run_fit(spec, folder, textures=textures, inputs=_files(config))
+    _run_fit(spec, folder, loose=loose, inputs=_files(config))
 
 
 @job_command(app, "joint")

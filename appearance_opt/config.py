@@ -13,6 +13,7 @@ from typing import Any, TypeVar
 
 from appearance_opt.errors import InputError
 from appearance_opt.options.baking import BakingOptions
+from appearance_opt.options.files import OutputOptions
 from appearance_opt.options.fitting import FittingOptions
 from appearance_opt.options.maps import DisplacementOptions, TextureOptions
 from appearance_opt.options.option import Record as Options
@@ -55,6 +56,7 @@ class CommonOptions(Options):
     fit: FittingOptions = part(FittingOptions)
     texture: TextureOptions = part(TextureOptions)
     displacement: DisplacementOptions = part(DisplacementOptions)
+    output: OutputOptions = part(OutputOptions)
     device: str = _device()
 
     def levels(self) -> tuple[int, ...]:

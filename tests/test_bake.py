@@ -142,7 +142,7 @@ def test_tilts_have_the_sign_that_engines_expect(tmp_path: Path) -> None:
     files = {}
     for green in ("opengl", "directx"):
         options = with_values(CLOSED, maps=("normal",), green=green)
-        bake(high, low, tmp_path / f"{green}.glb", options, textures=tmp_path / green)
+        bake(high, low, tmp_path / f"{green}.glb", options, loose=tmp_path / green)
         files[green] = read(tmp_path / green / f"{green}_normal.png")
     gl, dx = files["opengl"].astype(int), files["directx"].astype(int)
     # +X is towards growing u, +Y (up in the picture) is against growing v; 8 bits: half a step

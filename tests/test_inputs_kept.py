@@ -213,7 +213,7 @@ def test_loose_maps_and_result_appear_together(
     options = bake_options(closed_form=True, texture_size=32, unwrap=True)
     monkeypatch.setattr(bake, "_write_loose", full)
     with pytest.raises(OSError, match="No space"):
-        appearance_opt.bake(heavy, heavy, tmp_path / "x.gltf", options, textures=tmp_path / "maps")
+        appearance_opt.bake(heavy, heavy, tmp_path / "x.gltf", options, loose=tmp_path / "maps")
     assert not list(tmp_path.iterdir())
 
 

@@ -68,12 +68,10 @@ def test_loose_maps_do_not_replace_those_of_low(ball: Asset, tmp_path: Path) -> 
     options = bake_options(closed_form=True, unwrap=True, texture_size=64)
     with pytest.raises(InputError, match=f"could replace '.*{picture.name}'"):
         appearance_opt.bake(
-            ball, tmp_path / "low.obj", tmp_path / "new" / "low.glb", options, textures=tmp_path
+            ball, tmp_path / "low.obj", tmp_path / "new" / "low.glb", options, loose=tmp_path
         )
     with pytest.raises(InputError):
-        appearance_opt.bake(
-            ball, tmp_path / "low.obj", tmp_path / "b.glb", options, textures=picture
-        )
+        appearance_opt.bake(ball, tmp_path / "low.obj", tmp_path / "b.glb", options, loose=picture)
 
 
 def test_a_resumed_run_goes_on_from_the_same_start(

@@ -17,6 +17,8 @@ from appearance_opt.asset.file_options import PLAIN, TextureFormat, for_target, 
 from appearance_opt.asset.gltf_accessors import _chunks
 from appearance_opt.asset.types import Asset, Material, Mesh, Texture, Volume
 from appearance_opt.errors import InputError
+from appearance_opt.jobs.simplify import simplify
+from appearance_opt.options.files import OutputOptions
 from tests.conftest import grid_sphere
 
 LOSSY = TextureFormat("webp", "lossy", 90)
@@ -164,6 +166,28 @@ def test_a_target_heeds_what_the_format_can_hold(tmp_path: Path) -> None:
     assert (web.color.codec, web.normal.codec, web.quantize) == ("webp", "jpeg", True)
     assert for_target("web", tmp_path / "a.usdz").color.codec == "jpeg"
     assert for_target("film", tmp_path / "a.glb") == PLAIN
+
+
+def test_a_target_fills_what_is_not_given(tmp_path: Path) -> None:
+    pytest.importorskip("meshopt")
+    given = OutputOptions(target="web", textures="color=png", quantize=False)
+    options = given.for_file(tmp_path / "a.glb")
+    assert options.color == PLAIN.color
+    assert options.normal == for_target("web", tmp_path / "a.glb").normal
+    assert (options.quantize, options.compress) == (False, "meshopt")
+    with pytest.raises(InputError, match="--for print: choose from web, game, film"):
+        OutputOptions(target="print")
+
+
+def test_a_job_refuses_what_it_could_not_write_before_it_reads(tmp_path: Path) -> None:
+    for values, name in (
+        ({"textures": "webp"}, "out.usda"),
+        ({"compress": "meshopt"}, "out.obj"),
+        ({"quantize": True, "target": "web"}, "out.usdz"),
+    ):
+        with pytest.raises(InputError, match=r"out\.(usda|obj|usdz): "):
+            simplify(tmp_path / "absent.glb", tmp_path / name, triangles=10, **values)
+    assert not list(tmp_path.iterdir())
 
 
 # textures

@@ -49,7 +49,7 @@ def bake(
     options: BakeOptions | None = None,
     *,
     report: str | Path | None = None,
-    textures: str | Path | None = None,
+    loose: str | Path | None = None,
     progress: Progress | None = None,
     variants: dict[str, str] | None = None,
     began: float | None = None,
@@ -60,7 +60,7 @@ def bake(
     do not write).
 
     ``values``: options by flat key, instead of ``options`` or over them: ``closed_form=True``.
-    ``report``: folder for pictures, metrics and report.html. ``textures``: folder for the maps as
+    ``report``: folder for pictures, metrics and report.html. ``loose``: folder for the maps as
     loose files; maps for which the format of ``out`` has no place are always written, by default to
     ``<out's stem>_maps``. ``inputs``: other files that must not be replaced. Raises
     AppearanceError.
@@ -69,7 +69,7 @@ def bake(
 
     watch = Stopwatch(began, progress)
     options = resolve_options(BakeOptions, options, values)
-    outputs = Outputs.of(out, options, report=report, textures=textures)
+    outputs = Outputs.of(out, options, report=report, loose=loose)
     outputs.check()
     outputs.check_sources(high, low, *inputs)
     with outputs.held(), Interrupts() as interrupts:
@@ -94,8 +94,8 @@ def _bake(
     result, error = run.run(progress, outputs.report is not None)
     if outputs.out is not None:
         with publication() as together:
-            write(result.asset, together.place(outputs.out))
-            _write_loose(result, options, outputs.out, outputs.textures, together)
+            write(result.asset, together.place(outputs.out), options.output.for_file(outputs.out))
+            _write_loose(result, options, outputs.out, outputs.loose, together)
         watch.lap("write")
     interrupts.release()
     if error is not None:

@@ -6,7 +6,7 @@ import os
 import shutil
 import tempfile
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
 from glob import escape
 from pathlib import Path
@@ -14,9 +14,11 @@ from typing import TYPE_CHECKING
 
 from appearance_opt.asset import check_folder, check_writable
 from appearance_opt.asset.paths import MAX_NAME
+from appearance_opt.asset.texture_files import SUFFIXES
 from appearance_opt.errors import InputError
 from appearance_opt.fit.archive import FILES as CHECKPOINT_FILES
 from appearance_opt.lock import lock_path, locked
+from appearance_opt.options.files import OutputOptions
 from appearance_opt.publish import recover
 
 if TYPE_CHECKING:
@@ -46,14 +48,15 @@ REPORT_BYTES = 20 << 20
 @dataclass(frozen=True)
 class Outputs:
     """All that a job writes. ``out``: the result, with what its writer puts beside it; ``levels``:
-    tessellation levels that are written beside it, too; ``report``, ``checkpoint``, ``textures``:
-    folders."""
+    tessellation levels that are written beside it, too; ``report``, ``checkpoint``, ``loose`` (of
+    a bake's maps): folders."""
 
     out: Path | None = None
     report: Path | None = None
     checkpoint: Path | None = None
-    textures: Path | None = None
+    loose: Path | None = None
     levels: tuple[int, ...] = ()
+    output: OutputOptions = field(default_factory=OutputOptions)
 
     @classmethod
     def of(
@@ -63,18 +66,20 @@ class Outputs:
         *,
         report: str | Path | None = None,
         checkpoint: str | Path | None = None,
-        textures: str | Path | None = None,
+        loose: str | Path | None = None,
     ) -> Outputs:
-        """From what a job was given. ``options``: do they ask for tessellated meshes?"""
+        """From what a job was given. ``options``: how results are written, and are tessellated
+        meshes, too?"""
         levels = (
             options.levels()
             if options is not None and options.displacement.write_tessellated
             else ()
         )
-        out, report, checkpoint, textures = (
-            None if path is None else Path(path) for path in (out, report, checkpoint, textures)
+        out, report, checkpoint, loose = (
+            None if path is None else Path(path) for path in (out, report, checkpoint, loose)
         )
-        return cls(out, report, checkpoint, textures, levels)
+        output = OutputOptions() if options is None else options.output
+        return cls(out, report, checkpoint, loose, levels, output)
 
     @property
     def results(self) -> tuple[Path, ...]:
@@ -86,7 +91,7 @@ class Outputs:
     @property
     def folders(self) -> tuple[Path, ...]:
         """Folders with other files."""
-        return tuple(p for p in (self.report, self.checkpoint, self.textures) if p is not None)
+        return tuple(p for p in (self.report, self.checkpoint, self.loose) if p is not None)
 
     def patterns(self) -> list[tuple[Path, str]]:
         """(folder, pattern of names) of all files that could be written or replaced."""
@@ -98,8 +103,8 @@ class Outputs:
             out += [(self.report, name) for name in REPORT_FILES]
         if self.checkpoint is not None:
             out += [(self.checkpoint, name) for name in CHECKPOINT_FILES]
-        if self.textures is not None and self.out is not None:
-            out.append((self.textures, f"{escape(self.out.stem)}_*"))
+        if self.loose is not None and self.out is not None:
+            out.append((self.loose, f"{escape(self.out.stem)}_*"))
         return out
 
     def check(self) -> None:
@@ -108,6 +113,7 @@ class Outputs:
             longest = path.stem + (SUFFIX if path.suffix.lower() == ".obj" else "_textures")
             _check_names(path, [lock_path(path).name, longest])
             check_writable(path)
+            self.output.for_file(path)
             check_folder(path.parent)
         for folder in self.folders:
             _check_names(folder, [folder.name])
@@ -150,8 +156,8 @@ class Outputs:
         for path, level in zip(self.results, (0, *self.levels), strict=False):
             size = BYTES_PER_TRIANGLE * triangles * 4**level + BYTES_PER_TEXEL * texels
             need.append((path.parent, size))
-        if self.textures is not None:
-            need.append((self.textures, BYTES_PER_TEXEL * texels))
+        if self.loose is not None:
+            need.append((self.loose, BYTES_PER_TEXEL * texels))
         if self.report is not None:
             need.append((self.report, REPORT_BYTES))
         if self.checkpoint is not None:
@@ -213,6 +219,6 @@ def _beside(out: Path) -> tuple[str, ...]:
     stem = escape(out.stem)
     displacement = f"{stem}_displacement*.png"
     return {
-        ".obj": (f"{stem}.mtl", f"{stem}_*.png"),
-        ".gltf": (f"{stem}.bin", f"{stem}_[0-9]*.png", displacement),
+        ".obj": (f"{stem}.mtl", *(f"{stem}_*{s}" for s in SUFFIXES.values())),
+        ".gltf": (f"{stem}.bin", *(f"{stem}_[0-9]*{s}" for s in SUFFIXES.values()), displacement),
     }.get(out.suffix.lower(), (displacement,))

@@ -137,12 +137,13 @@ def write_result(result: SimplifyResult, out: Path, options: CommonOptions) -> N
     from appearance_opt.stages.displacement import write_companion
 
     with publication() as together:
-        write(result.asset, together.place(out))
+        files = options.output.for_file(out)
+        write(result.asset, together.place(out), files)
         if options.displacement.fitted:
             write_companion(result.asset, together.place(out))
         if options.displacement.write_tessellated:
             for level, asset in result.tessellated.items():
-                write(asset, together.place(level_path(out, level)))
+                write(asset, together.place(level_path(out, level)), files)
 
 
 def load_source(

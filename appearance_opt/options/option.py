@@ -90,7 +90,7 @@ class Record:
     def __post_init__(self) -> None:
         for f in fields(self):
             if "option" in f.metadata:
-                f.metadata["option"].check(flag_name(key_of(f)), getattr(self, f.name))
+                f.metadata["option"].check(spelling(f), getattr(self, f.name))
 
 
 @dataclass(frozen=True)
@@ -176,6 +176,12 @@ def key_of(f: Field) -> str:
     """Flat key of a field."""
     spec: Spec | None = f.metadata.get("option")
     return f.name if spec is None or not spec.key else spec.key
+
+
+def spelling(f: Field) -> str:
+    """What the command line calls a field, without dashes before it."""
+    spec: Spec = f.metadata["option"]
+    return spec.flag.split("/")[0].lstrip("-") or flag_name(key_of(f))
 
 
 def flag_name(key: str) -> str:
