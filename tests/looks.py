@@ -14,7 +14,7 @@ SMALL = {
     "appearance_opt.initial.density": {"BATCHES": 1, "RESOLUTION": 64},
     "appearance_opt.initial.reallocate": {"RESOLUTION": 64},
     "appearance_opt.jobs.report": {"VIEWS": 2, "RESOLUTION": 64, "PICTURED": 2},
-    "appearance_opt.stages.start": {"VISIBILITY_VIEWS": 64},
+    "appearance_opt.initial.decimation": {"VISIBILITY_VIEWS": 64},
     "appearance_opt.stages.growth": {"RESOLUTION": 64, "POOL": 64},
 }
 """Values of module constants."""

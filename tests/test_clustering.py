@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from appearance_opt.initial.clustering import cluster
-from appearance_opt.stages.start import LEAST_CLUSTERS, is_coarse
+from appearance_opt.initial.decimation import LEAST_CLUSTERS, is_coarse
 from tests.conftest import grid_sphere
 
 

@@ -19,7 +19,7 @@ from appearance_opt.asset.types import Asset, Mesh, srgb_to_linear
 from appearance_opt.baking.target_mesh import movable, unwrap_asset
 from appearance_opt.errors import InputError
 from appearance_opt.initial.decimate import decimate
-from appearance_opt.jobs.simplify import load_source
+from appearance_opt.jobs.lifecycle import load_source
 from appearance_opt.latent.mesh import LatentMesh
 
 

@@ -40,8 +40,8 @@ from appearance_opt.stages.displacement import (
     map_size,
     median_edge,
     without_outliers,
-    write_companion,
 )
+from appearance_opt.stages.export import write_companion
 from appearance_opt.views import ViewSampler
 from scenes.analytic import bumps, bumpy_sphere
 from tests.kernels import BLOCK, settles

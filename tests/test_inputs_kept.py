@@ -221,7 +221,7 @@ def test_jobs_that_change_an_input_would_be_noticed(
     ball: Asset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The watch of every test, on a job with a planted fault."""
-    from appearance_opt.jobs import simplify as job
+    from appearance_opt.jobs import lifecycle as job
 
     save(ball, tmp_path / "a.glb")
     (tmp_path / "beside.txt").write_text("kept")

@@ -15,7 +15,7 @@ from appearance_opt.asset.types import Asset
 from appearance_opt.config import simplify_options
 from appearance_opt.fit.validation import Validation
 from appearance_opt.interrupts import Interrupts
-from appearance_opt.jobs import simplify as job
+from appearance_opt.jobs import lifecycle as job
 
 
 def interrupt(number: int = signal.SIGINT) -> None:

@@ -22,7 +22,7 @@ from appearance_opt.config import (
     simplify_options,
 )
 from appearance_opt.errors import InputError
-from appearance_opt.stages import start
+from appearance_opt.stages import decimated
 from scenes.analytic import two_materials
 
 QUICK = {"texture_size": 64, "resolution": 32, "pool": 8, "views": 2, "budget": None}
@@ -80,8 +80,8 @@ def test_a_resumed_run_goes_on_from_the_same_start(
     """How often triangles are moved follows from the time that is left: a resumed run may have less
     of it."""
     heavy, rounds = two_materials(2000), iter([1, 0])
-    monkeypatch.setattr(start, "affordable", lambda *_: next(rounds))
-    monkeypatch.setattr(start, "WORTHWHILE", 0.0)
+    monkeypatch.setattr(decimated, "affordable", lambda *_: next(rounds))
+    monkeypatch.setattr(decimated, "WORTHWHILE", 0.0)
     first = appearance_opt.simplify(heavy, None, quick(), checkpoint=tmp_path)
     again = appearance_opt.simplify(heavy, None, quick(), checkpoint=tmp_path, resume=True)
     assert next(rounds) == 0  # the start was not made again
@@ -96,8 +96,8 @@ def test_a_state_of_another_start_is_refused(
     """The same job, whose start came out otherwise, as it may where time is short: as many
     vertices, elsewhere."""
     heavy, rounds = two_materials(2000), iter([1, 0])
-    monkeypatch.setattr(start, "affordable", lambda *_: next(rounds))
-    monkeypatch.setattr(start, "WORTHWHILE", 10.0)
+    monkeypatch.setattr(decimated, "affordable", lambda *_: next(rounds))
+    monkeypatch.setattr(decimated, "WORTHWHILE", 10.0)
     for folder in ("a", "b"):
         appearance_opt.simplify(heavy, None, quick(), checkpoint=tmp_path / folder)
     shutil.copy(tmp_path / "b" / "start.npz", tmp_path / "a" / "start.npz")

@@ -14,7 +14,7 @@ from appearance_opt.initial.sphere import sphere
 from appearance_opt.reference.mesh import MeshReference
 from appearance_opt.reference.subject import Subject
 from appearance_opt.reference.survey import MeshSurvey
-from appearance_opt.stages.start import affordable, make_start
+from appearance_opt.stages.decimated import affordable, decimate_start
 from appearance_opt.views import ViewSampler
 from scenes.analytic import bumpy_sphere
 
@@ -52,7 +52,7 @@ def bumps() -> Subject:
 
 def test_the_error_of_a_start_is_found_where_it_is(bumps: Subject) -> None:
     options = simplify_options(triangles=800, texture_size=128, reallocate=0)
-    start = make_start(bumps, options, 800)
+    start = decimate_start(bumps, options, 800)
     judge = StartError(bumps.reference, bumps.survey.triangles, SAMPLER.held_out(3), views=16)
     whole, by_face = judge.measure(start.mesh, start.maps)
     assert by_face.shape == (len(bumps.survey.triangles.faces),) and by_face.sum() > 0
@@ -77,7 +77,7 @@ def test_the_best_start_of_all_rounds_is_kept(bumps: Subject) -> None:
     error = []
     for rounds in (0, 1):
         options = simplify_options(triangles=500, texture_size=128, reallocate=rounds)
-        start = make_start(bumps, options, 500)
+        start = decimate_start(bumps, options, 500)
         assert len(start.mesh.faces) <= 500
         error.append(judge.measure(start.mesh, start.maps)[0])
     # by other views than those that it was chosen by
@@ -103,12 +103,12 @@ def black_on(side: float) -> Subject:
 
 def test_triangles_move_to_where_something_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
-        "appearance_opt.stages.start.WORTHWHILE", 2.0
+        "appearance_opt.stages.decimated.WORTHWHILE", 2.0
     )  # the moved ones are taken, whatever they gain
     monkeypatch.setattr("appearance_opt.initial.reallocate.RESOLUTION", 128)
     share = []
     for side in (-1.0, 1.0):
-        start = make_start(
+        start = decimate_start(
             black_on(side),
             simplify_options(triangles=300, texture_size=128, reallocate=1),
             300,
@@ -130,7 +130,7 @@ def test_hidden_starts_have_no_error(ball: Asset) -> None:
     subject = subject_of(ball)
     far = ViewSampler((50.0, 0.0, 0.0), 1.0)
     options = simplify_options(triangles=200, texture_size=32, reallocate=0)
-    start = make_start(subject, options, 200)
+    start = decimate_start(subject, options, 200)
     error, by_face = StartError(subject.reference, subject.survey.triangles, far, views=8).measure(
         start.mesh, start.maps
     )

@@ -14,13 +14,13 @@ from appearance_opt.asset import load, save
 from appearance_opt.asset.alpha import kind_of, seen_through
 from appearance_opt.asset.types import Asset, Material, Mesh, Texture
 from appearance_opt.errors import InputError
-from appearance_opt.interrupts import Interrupts
 from appearance_opt.jobs import report
-from appearance_opt.jobs.bake import BakeJob
 from appearance_opt.jobs.simplify import fingerprint
 from appearance_opt.placement import Placement
-from appearance_opt.stages.fitting import Stopwatch
+from appearance_opt.reference.subject import Subject
+from appearance_opt.stages.pair import Pair
 from appearance_opt.stages.parts import split
+from appearance_opt.stages.run import Run
 from appearance_opt.stages.start import atlas_of
 from tests.conftest import grid_sphere
 
@@ -127,9 +127,9 @@ def test_nothing_left_to_work_on_is_refused(tmp_path: Path, snow_globe: Asset) -
 
 
 def test_a_start_from_a_file_leaves_its_transparent_parts_out(snow_globe: Asset) -> None:
-    mesh, notes = atlas_of(
-        snow_globe, Placement(), 5000, options(triangles=None, init="globe.glb"), np.zeros(1, bool)
-    )
+    opaque = replace(snow_globe, meshes=snow_globe.meshes[1:2])
+    subject = Subject.of_asset(opaque, placement=Placement())
+    mesh, notes = atlas_of(snow_globe, subject, options(triangles=None, init="globe.glb"))
     assert len(mesh.faces) == len(snow_globe.meshes[1].faces)
     assert "of --init are left out" in notes[0]
 
@@ -183,19 +183,13 @@ def test_what_is_aligned_is_aligned_whole(snow_globe: Asset) -> None:
     )
     low = Asset((ball(0.5, Material("low", BLUE), "low", 16),), "low")
     parts = split(moved, "HIGH", "bake"), split(low, "LOW", "bake onto")
-    job = BakeJob(
-        *parts,
-        "LOW",
-        appearance_opt.bake_options(align=True, unwrap=True),
-        Stopwatch(),
-        Interrupts(),
-    )
+    job = Pair.of(*parts, "LOW", appearance_opt.bake_options(align=True, unwrap=True), Run())
     for mesh, name in zip(job.high.meshes, ("ball", "shell", "sticker"), strict=True):
         expected = next(m for m in snow_globe.meshes if m.name == name)
         np.testing.assert_allclose(mesh.positions, expected.positions, atol=2e-3)
     shown = job.shown()
     assert shown.placement.scale > 1.04  # the label, at 1.05, is in the picture
-    assert job.placement.scale < 0.6
+    assert job.subject.placement.scale < 0.6
     assert shown.sampler.hull is not None
 
 

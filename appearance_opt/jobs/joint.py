@@ -3,22 +3,29 @@ together."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from appearance_opt.baking.closed_form import Settings, bake
+from appearance_opt.baking.target_mesh import movable
 from appearance_opt.config import JointOptions, resolve_options, with_values
-from appearance_opt.interrupts import Interrupts
+from appearance_opt.jobs.lifecycle import close_run, open_run, read_pair, write_levels
 from appearance_opt.jobs.paths import Outputs
 from appearance_opt.jobs.result import SimplifyResult
-from appearance_opt.jobs.simplify import write_result
+from appearance_opt.stages.displacement import bake_displacement
+from appearance_opt.stages.export import Exporter, export
+from appearance_opt.stages.fitting import fit_start
+from appearance_opt.stages.start import Start, select_told
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from appearance_opt.asset.types import Asset
     from appearance_opt.fit.loop import Progress
-    from appearance_opt.jobs.bake import BakeJob
-    from appearance_opt.stages.fitting import Stopwatch
+    from appearance_opt.stages.pair import Pair
+    from appearance_opt.stages.run import Run
 
 
 def joint(
@@ -39,111 +46,32 @@ def joint(
     kind of detail goes where it is represented best. ``values``: options by flat key, instead of
     ``options`` or over them. ``inputs``: other files that must not be replaced. Raises
     AppearanceError."""
-    from appearance_opt.stages.fitting import Stopwatch
-
-    watch = Stopwatch(began, progress)
     options = resolve_options(JointOptions, options, values)
     outputs = Outputs.of(out, options, report=report)
-    outputs.check()
-    outputs.check_sources(high, low, *inputs)
-    with outputs.held(), Interrupts() as interrupts:
-        return _fit_pair(high, low, outputs, options, progress, variants, watch, interrupts)
-
-
-def _fit_pair(
-    high: str | Path | Asset,
-    low: str | Path | Asset,
-    outputs: Outputs,
-    options: JointOptions,
-    progress: Progress | None,
-    variants: dict[str, str] | None,
-    watch: Stopwatch,
-    interrupts: Interrupts,
-) -> SimplifyResult:
-    from appearance_opt.jobs.bake import BakeJob, read_pair
-    from appearance_opt.stages.displacement import require_memory
-    from appearance_opt.stages.fitting import conclude
-
-    parts = read_pair(high, low, outputs, options, variants, watch)
-    require_memory(parts[1].fitted.triangle_count, options)
-    job = BakeJob(*parts, options, watch, interrupts)
-    result = _fit_job(job, options, progress, outputs.report is not None)
-    if outputs.out is not None:
-        write_result(result, outputs.out, options)
-        watch.lap("write")
-    interrupts.release()
-    if result.error is not None:
-        raise result.error
-
-    def write_report() -> None:
-        from appearance_opt.jobs.report import write_job_report
-
-        assert outputs.report is not None
-        write_job_report(outputs.report, result, job.shown(), options)
-
-    conclude(result, watch, None if outputs.report is None else write_report)
+    with open_run(outputs, (high, low, *inputs), options, progress, began) as run:
+        pair = read_pair(high, low, outputs, options, variants, run)
+        result = _fit(pair, options, run)
+        beside = partial(write_levels, result, options)
+        close_run(run, result, outputs, options, pair.shown, beside)
     return result
 
 
-def _fit_job(
-    job: BakeJob, options: JointOptions, progress: Progress | None, with_report: bool
-) -> SimplifyResult:
-    from appearance_opt.baking.closed_form import Settings, bake
-    from appearance_opt.baking.target_mesh import movable
-    from appearance_opt.initial.transfer import transfer_emission
-    from appearance_opt.latent.build import latent_of
-    from appearance_opt.stages.displacement import Exporter, bake_displacement
-    from appearance_opt.stages.fitting import clean_maps, fit_start
-    from appearance_opt.stages.plain import flatten_maps
-    from appearance_opt.stages.start import Start, select_told
-
-    light, with_kept = job.low_parts.fitted, job.low_parts.with_kept
-    mesh = movable(job.mesh)
-    drawn, displacement = bake_displacement(job.survey, mesh, options, job.cage)
-    found = bake(job.survey, drawn, Settings(options.texture.size, samples=options.baking.samples))
-    job.check_missed(found)
-    start = Start(
-        mesh,
-        {**select_told(job.subject.unlit, found.maps), **displacement},
-        True,
-        found.covered,
-        options.levels(),
-    )
-    job.watch.lap("closed form")
-    parts = tuple(dict.fromkeys(("shape", *options.fit.parts)))
-    model, fitted, error = fit_start(
-        job.subject.reference,
-        job.subject.sampler,
-        start,
-        with_values(options, fit=parts),
-        job.watch,
-        interrupts=job.interrupts,
-        laplacian=options.fit.laplacian,
-        progress=progress,
-        with_report=with_report,
-    )
-    exporter = Exporter(job.placement, light.origin, light.name)
-    initial = latent_of(mesh, start.maps, levels=start.levels[-1:])
-    final = clean_maps(model, start.known)
-    final |= transfer_emission(job.survey, model.posed_mesh(), options.texture.size)
-    final = flatten_maps(model, final, start, job.subject.reference, job.subject.sampler, options)
-    tessellated = {k: with_kept(a) for k, a in exporter.drawn(model, final).items()}
-    before, after = len(job.survey.triangles.faces), len(mesh.faces)
-    result = SimplifyResult(
-        with_kept(exporter.base(model, final)),
-        {
-            "start": with_kept(exporter.drawn(initial, start.maps)[initial.pose.level]),
-            **{f"level {k}": a for k, a in tessellated.items()},
-        },
-        title=f"{job.high.name}: {before:,} to {after:,} triangles",
-        facts={"triangles": f"{after} of {before}"},
-        notes=[*job.notes, *fitted.notes()],
-        error=error,
-        fit=fitted,
-        triangles=after,
-        source_triangles=before,
-        kept_triangles=job.low_parts.kept_triangles,
-        tessellated=tessellated,
-    )
-    job.watch.lap("export")
-    return result
+def _fit(pair: Pair, options: JointOptions, run: Run) -> SimplifyResult:
+    """The closed form, displacement first, and the fit that starts from it."""
+    mesh, survey, subject = movable(pair.mesh), pair.survey, pair.subject
+    drawn, displacement = bake_displacement(survey, mesh, options, pair.cage)
+    settings = Settings(options.texture.size, samples=options.baking.samples)
+    found = bake(survey, drawn, settings)
+    pair.check_missed(found)
+    maps = {**select_told(subject.unlit, found.maps), **displacement}
+    start = Start(mesh, maps, True, found.covered, options.levels())
+    run.lap("closed form")
+    fitted = tuple(dict.fromkeys(("shape", *options.fit.parts)))
+    model, fit, error = fit_start(subject, start, with_values(options, fit=fitted), run)
+    light = pair.low_parts.fitted
+    exporter = Exporter(subject.placement, light.origin, light.name)
+    exported = export(model, start, subject, options, exporter)
+    run.lap("export")
+    source = (pair.high.name, len(survey.triangles.faces))
+    result = SimplifyResult.of(exported, pair.low_parts, fit, source, pair.notes)
+    return replace(result, error=error)

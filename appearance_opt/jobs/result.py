@@ -6,12 +6,16 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     import numpy as np
     from numpy.typing import NDArray
 
     from appearance_opt.asset.types import Asset
     from appearance_opt.errors import DivergedError
     from appearance_opt.fit.loop import FitResult
+    from appearance_opt.stages.export import Exported
+    from appearance_opt.stages.parts import Parts
 
 
 @dataclass
@@ -62,6 +66,35 @@ class SimplifyResult(Result):
     source_triangles: int = field(kw_only=True)
     kept_triangles: int = 0
     tessellated: dict[int, Asset] = field(default_factory=dict)
+
+    @classmethod
+    def of(
+        cls,
+        exported: Exported,
+        parts: Parts,
+        fit: FitResult,
+        source: tuple[str, int],
+        notes: Iterable[str],
+    ) -> SimplifyResult:
+        """What was fitted, with the ``parts`` that were left alone after it. ``source``: name of
+        what it was fitted to, and number of its triangles (0: it has none)."""
+        name, before = source
+        asset, start, after = exported.asset, exported.start, exported.asset.triangle_count
+        levels = {k: parts.with_kept(a) for k, a in exported.levels.items()}
+        kept = parts.with_kept(asset)
+        last = {f"level {k}": a for k, a in levels.items()} or {"result": kept}
+        return cls(
+            kept,
+            {"start": parts.with_kept(start), **last},
+            title=f"{name}: {f'{before:,} to ' if before else ''}{after:,} triangles",
+            facts={"triangles": f"{after} of {before}" if before else after},
+            notes=[*notes, *fit.notes()],
+            fit=fit,
+            triangles=after,
+            source_triangles=before,
+            kept_triangles=parts.kept_triangles,
+            tessellated=levels,
+        )
 
 
 @dataclass

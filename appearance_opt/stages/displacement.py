@@ -4,7 +4,6 @@ written."""
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import drjit as dr
@@ -13,24 +12,18 @@ import numpy as np
 from scipy.ndimage import median_filter
 
 from appearance_opt import memory
-from appearance_opt.asset.height import displacement_of, height_png
 from appearance_opt.baking.closed_form import Settings, bake
 from appearance_opt.errors import InputError
 from appearance_opt.initial.atlas import GUTTER
-from appearance_opt.latent.displacement import DISPLACEMENT, Height, Tessellator, footprint
-from appearance_opt.latent.export import to_asset
+from appearance_opt.latent.displacement import DISPLACEMENT, Tessellator, footprint
 from appearance_opt.latent.subdivision import tessellate
 from appearance_opt.latent.texels import TexelCodec
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from appearance_opt.asset.origin import Origin
-    from appearance_opt.asset.types import Asset
     from appearance_opt.config import CommonOptions
-    from appearance_opt.latent.latent import Latent
     from appearance_opt.latent.mesh import LatentMesh
-    from appearance_opt.placement import Placement
     from appearance_opt.reference.survey import Survey
 
 FILLED = 0.6
@@ -127,46 +120,3 @@ def without_outliers(heights: NDArray[np.float32], tolerance: float) -> NDArray[
     that did become that median."""
     middle = median_filter(heights, AROUND)
     return np.where(np.abs(heights - middle) > tolerance, middle, heights).astype(np.float32)
-
-
-class Exporter:
-    """Assets of a displaced model, in the place and scale of the input, relative to its ``origin``.
-    ``placement``: of the model in the world."""
-
-    def __init__(self, placement: Placement, origin: Origin, name: str) -> None:
-        self.placement, self.origin, self.name = placement.relative_to(origin), origin, name
-
-    def base(self, model: Latent, maps: dict) -> Asset:
-        """The base mesh, its maps, and the displacement map in metres."""
-        asset = self._asset(model.mesh, model.host_positions(), maps, self.name)
-        height = model.part(Height)
-        if height is None:
-            return asset
-        heights = height.export()[DISPLACEMENT]
-        displacement = displacement_of(heights * np.float32(self.placement.scale))
-        meshes = (
-            replace(m, material=replace(m.material, displacement=displacement))
-            for m in asset.meshes
-        )
-        return replace(asset, meshes=tuple(meshes))
-
-    def drawn(self, model: Latent, maps: dict) -> dict[int, Asset]:
-        """The mesh as it is drawn at each tessellation level."""
-        out = {}
-        for pose in model.poses:
-            mesh, name = model.posed_mesh(pose), f"{self.name}_level{pose.level}"
-            out[pose.level] = self._asset(mesh, mesh.positions, maps, name)
-        return out
-
-    def _asset(self, mesh: LatentMesh, positions: NDArray, maps: dict, name: str) -> Asset:
-        return replace(
-            to_asset(mesh, self.placement.to_world(positions), maps, name), origin=self.origin
-        )
-
-
-def write_companion(asset: Asset, out: Path) -> None:
-    """The displacement map as ``<stem>_displacement.png`` for a format that has no place for its
-    name."""
-    displacement = asset.meshes[0].material.displacement
-    if displacement is not None and out.suffix.lower() == ".obj":
-        out.with_name(f"{out.stem}_displacement.png").write_bytes(height_png(displacement))

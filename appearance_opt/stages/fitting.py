@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import logging
-import time
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -22,17 +21,12 @@ from appearance_opt.render.quality import Quality
 from appearance_opt.views import VALIDATION
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from numpy.typing import NDArray
 
     from appearance_opt.config import CommonOptions
-    from appearance_opt.fit.checkpoint import Checkpointer
-    from appearance_opt.fit.loop import Progress
-    from appearance_opt.interrupts import Interrupts
-    from appearance_opt.reference.base import Reference
+    from appearance_opt.reference.subject import Subject
+    from appearance_opt.stages.run import Run
     from appearance_opt.stages.start import Start
-    from appearance_opt.views import ViewSampler
 
 log = logging.getLogger(__name__)
 
@@ -47,85 +41,18 @@ DISPLACEMENT_RATE = 4.0
 """Rate of the displacement map in units of that of the normal map: its texels move by a fraction of
 the finest edge, which is an eighth of the base edge at level 3."""
 
-EXPORT_SECONDS = 1.0
-"""Time kept back from the budget for writing the result; the report has a reserve of its own."""
-
-REPORT_SECONDS = 5.0
-
-
-class Stopwatch:
-    """Seconds by stage. ``began``: ``time.perf_counter()`` of the start, by default now.
-    ``progress``: told what begins."""
-
-    def __init__(self, began: float | None = None, progress: Progress | None = None) -> None:
-        self._progress = progress
-        self.began = self._last = time.perf_counter() if began is None else began
-        self.stages: dict[str, float] = {}
-
-    def begin(self, text: str) -> None:
-        """Say what begins, in a few words."""
-        if self._progress is not None:
-            self._progress.stage(text)
-
-    def lap(self, stage: str) -> None:
-        """Everything since the last lap was ``stage``."""
-        now = time.perf_counter()
-        self.stages[stage] = self.stages.get(stage, 0.0) + now - self._last
-        self._last = now
-
-    @property
-    def total(self) -> float:
-        """Seconds since the start."""
-        return time.perf_counter() - self.began
-
-
-class Timed(Protocol):
-    """What the results of all jobs have."""
-
-    seconds: dict[str, float]
-    notes: list[str]
-
-
-def conclude(result: Timed, watch: Stopwatch, write_report: Callable[[], None] | None) -> None:
-    """Write the report, if there is to be one, and note the time of every stage. The result is
-    written already: a Ctrl-C from here on, the imports of the report included, ends the report
-    alone."""
-    if write_report is not None:
-        watch.begin("drawing the report")
-        result.seconds = dict(watch.stages)
-        try:
-            write_report()
-        except KeyboardInterrupt:
-            result.notes.append(
-                "interrupted while the report was made: the result is complete, the report is missing"
-            )
-        watch.lap("report")
-    result.seconds = {**watch.stages, "total": watch.total}
-
 
 def fit_start(
-    reference: Reference,
-    sampler: ViewSampler,
-    start: Start,
-    options: CommonOptions,
-    watch: Stopwatch,
-    *,
-    interrupts: Interrupts,
-    laplacian: float = 0.0,
-    relative: bool = True,
-    progress: Progress | None = None,
-    checkpointer: Checkpointer | None = None,
-    with_report: bool = False,
+    subject: Subject, start: Start, options: CommonOptions, run: Run
 ) -> tuple[Latent, FitResult, DivergedError | None]:
-    """Fit what ``options.fit.parts`` names, from ``start``, within what is left of the budget on
-    ``watch``.
+    """Fit what ``options.fit.parts`` names, from ``start``, within what is left of the budget.
 
     The model is left at its best state by held-out PSNR; so it is when the fit diverged, which is
-    returned rather than raised: the state is worth writing first. From here on ``interrupts``
-    protect the result.
+    returned rather than raised: the state is worth writing first. From here on the interrupts of
+    ``run`` protect the result.
     """
-    interrupts.protect()
-    o = options
+    run.interrupts.protect()
+    o, reference, sampler = options, subject.reference, subject.sampler
     width = point_width(o.views.resolution, o.texture.size)
     pool = ReferencePool(
         reference,
@@ -142,7 +69,7 @@ def fit_start(
     parts = frozenset(o.fit.parts) | ({DISPLACEMENT} if o.displacement.fitted else set())
     model = latent_of(start.mesh, start.maps, parts, Rates(), start.levels)
     quality, rates = fit_policy(
-        validation.psnr(model), start.relative, start.grown, patience(o, watch, with_report)
+        validation.psnr(model), start.relative, start.grown, patience(o, run.seconds_left())
     )
     given = (
         o.fit.position_rate,
@@ -153,40 +80,40 @@ def fit_start(
     )
     defaults = (rates.position, rates.normal, rates.base_color, rates.material, rates.displacement)
     model.set_rates(Rates(*(d if g is None else g for g, d in zip(given, defaults, strict=True))))
-    watch.lap("set-up")
-    seconds = seconds_left(o, watch, with_report)
+    run.lap("set-up")
+    seconds = run.seconds_left()
     if seconds == 0.0:
         log.warning(
             "--budget %.0f s holds no more than set-up (%.0f s so far) and writing: the result is the start, "
             "without a fit",
             o.fit.budget,
-            watch.total,
+            run.watch.total,
         )
     fit_options = FitOptions(
         steps=o.fit.steps if seconds is not None or o.fit.steps is not None else 1000,
         seconds=seconds,
         loss=o.fit.loss,
-        laplacian=laplacian,
-        relative=relative,
+        laplacian=o.fit.laplacian,
+        relative=start.relative if o.fit.relative is None else o.fit.relative,
         background=o.views.background_color(),
         quality=quality,
         seed=o.views.seed,
     )
     error = None
     try:
-        fitted = fit(model, pool, validation, fit_options, progress, checkpointer, interrupts.asked)
+        fitted = fit(
+            model,
+            pool,
+            validation,
+            fit_options,
+            run.progress,
+            run.checkpointer,
+            run.interrupts.asked,
+        )
     except DivergedError as diverged:
         error, fitted = diverged, FitResult()
-    watch.lap("fit")
+    run.lap("fit")
     return model, fitted, error
-
-
-def seconds_left(options: CommonOptions, watch: Stopwatch, with_report: bool) -> float | None:
-    """Seconds of the budget that are left for fitting; None without a budget."""
-    if options.fit.budget is None:
-        return None
-    reserve = EXPORT_SECONDS + (REPORT_SECONDS if with_report else 0.0)
-    return max(options.fit.budget - watch.total - reserve, 0.0)
 
 
 def point_width(resolution: int, texture_size: int) -> float:
@@ -213,9 +140,9 @@ LONG = (600, 40.0)  # docs/trials.md: rates
 """Steps or seconds of a fit that is long enough for the least rates."""
 
 
-def patience(options: CommonOptions, watch: Stopwatch, with_report: bool) -> float:
-    """How long a fit will be, from 0 to 1 (as in ``LONG``, or longer)."""
-    seconds = seconds_left(options, watch, with_report)
+def patience(options: CommonOptions, seconds: float | None) -> float:
+    """How long a fit will be that has so many ``seconds`` (None: no limit), from 0 to 1 (as in
+    ``LONG``, or longer)."""
     by_steps = 1.0 if options.fit.steps is None else options.fit.steps / LONG[0]
     return min(1.0, by_steps, 1.0 if seconds is None else seconds / LONG[1])
 

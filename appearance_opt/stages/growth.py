@@ -21,9 +21,10 @@ from appearance_opt.fit.loop import FitOptions, FitResult, fit
 from appearance_opt.fit.validation import Validation
 from appearance_opt.initial.atlas import unwrap
 from appearance_opt.initial.decimate import decimate
-from appearance_opt.initial.sphere import random_maps, sphere
+from appearance_opt.initial.sphere import SMALLEST, random_maps, sphere
 from appearance_opt.interrupts import Interrupts
 from appearance_opt.latent.build import latent_of
+from appearance_opt.latent.displacement import DISPLACEMENT
 from appearance_opt.latent.export import to_asset
 from appearance_opt.latent.latent import Latent
 from appearance_opt.latent.mesh import LatentMesh
@@ -32,6 +33,7 @@ from appearance_opt.latent.positions import Positions
 from appearance_opt.reference.mesh import MeshReference
 from appearance_opt.reference.pool import ReferencePool
 from appearance_opt.reference.survey import MeshSurvey
+from appearance_opt.stages.displacement import flat_map
 from appearance_opt.stages.fitting import VALIDATION_VIEWS, clean_maps
 from appearance_opt.stages.start import Start, require_survey, select_told, transfer_appearance
 from appearance_opt.views import VALIDATION
@@ -86,6 +88,30 @@ class Effort:
     interrupts: Interrupts = field(default_factory=Interrupts)
 
 
+def sphere_start(subject: Subject, options: SimplifyOptions, triangles: int) -> Start:
+    """A sphere that knows nothing of the reference, with random maps and a flat displacement if
+    there is to be one. Raises InputError if it would have too few triangles to be one."""
+    if triangles < SMALLEST:
+        raise InputError(f"--init sphere needs at least {SMALLEST} triangles, not {triangles}")
+    size, sampler = options.texture.size, subject.sampler
+    mesh = sphere(triangles, sampler.centre, 0.6 * sampler.radius, size)
+    maps = unknown_maps(subject, options, size)
+    known = np.zeros((size, size), bool)
+    if not options.displacement.fitted:
+        return Start(mesh, maps, False, known)
+    return Start(
+        mesh, {**maps, DISPLACEMENT: flat_map(mesh, options)}, False, known, options.levels()
+    )
+
+
+def unknown_maps(
+    subject: Subject, options: SimplifyOptions, size: int
+) -> dict[str, NDArray | float]:
+    """Random maps where nothing is known of those of the reference."""
+    with_normals = options.texture.normal_map and "normal" in options.fit.parts
+    return select_told(subject.unlit, random_maps(size, options.views.seed, with_normals))
+
+
 def grow_start(
     subject: Subject,
     options: SimplifyOptions,
@@ -95,14 +121,7 @@ def grow_start(
     """(start, interrupted), grown from a sphere. Only images of the reference are used."""
     texture = min(TEXTURE, options.texture.size)
     mesh = first_shape(triangles, subject.sampler, texture)
-    maps = select_told(
-        subject.unlit,
-        random_maps(
-            texture,
-            options.views.seed,
-            options.texture.normal_map and "normal" in options.fit.parts,
-        ),
-    )
+    maps = unknown_maps(subject, options, texture)
     model, result = _fit_shape(subject, options, mesh, maps, 1.0, effort)
     likeness = to_asset(
         mesh, model.host_positions(), clean_maps(model, np.zeros((texture, texture), bool)), "grown"

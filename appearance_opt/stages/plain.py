@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from appearance_opt.config import CommonOptions
     from appearance_opt.latent.latent import Latent
     from appearance_opt.reference.base import Reference
+    from appearance_opt.reference.subject import Subject
     from appearance_opt.stages.start import Start
     from appearance_opt.views import ViewSampler
 
@@ -54,15 +55,14 @@ def flatten_maps(
     model: Latent,
     maps: Maps,
     start: Start,
-    reference: Reference,
-    sampler: ViewSampler,
+    subject: Subject,
     options: CommonOptions,
 ) -> Maps:
     """The ``maps`` of a fitted model as they are to be written: see ``replace_constant``."""
     judge = (
         None
         if model.fitted(Texels) is None
-        else Pictures(model, reference, sampler, min(options.views.resolution, 256))
+        else Pictures(model, subject.reference, subject.sampler, min(options.views.resolution, 256))
     )
     return replace_constant(maps, start.known, judge, start.maps)
 

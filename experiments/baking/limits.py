@@ -59,11 +59,13 @@ def limits(asset: str, steps: int, views: int) -> dict:
     from appearance_opt.baking.closed_form import Settings, bake
     from appearance_opt.fit.loop import FitOptions, fit
     from appearance_opt.fit.validation import Validation
-    from appearance_opt.jobs.bake import BakeJob
     from appearance_opt.latent.build import latent_of
     from appearance_opt.latent.parameter import Rates
     from appearance_opt.reference.pool import ReferencePool
-    from appearance_opt.stages.fitting import POOL_SAMPLES, Stopwatch, fit_policy, point_width
+    from appearance_opt.stages.fitting import POOL_SAMPLES, fit_policy, point_width
+    from appearance_opt.stages.pair import Pair
+    from appearance_opt.stages.parts import split
+    from appearance_opt.stages.run import Run
     from appearance_opt.views import MEASURED, Views
 
     backend.select("cpu")
@@ -71,18 +73,19 @@ def limits(asset: str, steps: int, views: int) -> dict:
     if not low.exists():
         FOLDER.mkdir(parents=True, exist_ok=True)
         make_low(source, ROWS[asset], low)
-    job = BakeJob(load(source), load(low), asset, bake_options(texture_size=SIZE), Stopwatch())
-    maps = dict(bake(job.reference, job.mesh, Settings(SIZE, samples=4)).maps)
-    sampler = job.sampler.held_out(MEASURED)
+    parts = split(load(source), asset, "bake"), split(load(low, keep_layout=True), asset, "bake")
+    pair = Pair.of(*parts, asset, bake_options(texture_size=SIZE), Run())
+    maps = dict(bake(pair.survey, pair.mesh, Settings(SIZE, samples=4)).maps)
+    reference, sampler = pair.subject.reference, pair.subject.sampler.held_out(MEASURED)
     drawn = Views.concatenate([sampler.draw(k, 4) for k in range(views // 4)])
-    model = latent_of(job.mesh, maps, frozenset({"normal", "material"}), Rates())
-    exact = Validation(job.reference, drawn, RESOLUTION, 16)
+    model = latent_of(pair.mesh, maps, frozenset({"normal", "material"}), Rates())
+    exact = Validation(reference, drawn, RESOLUTION, 16)
     model.set_rates(fit_policy(exact.psnr(model), likeness=True)[1])
-    images = job.reference.render(drawn, RESOLUTION, 16)
+    images = reference.render(drawn, RESOLUTION, 16)
     psnr, share, bound = outline_share(images, exact.render(model))
     # the pool draws the same groups of four from the same stream: it holds these views and no other
     pool = ReferencePool(
-        job.reference,
+        reference,
         sampler,
         4 * (views // 4),
         4,

@@ -22,8 +22,9 @@ from appearance_opt.latent.positions import Positions
 from appearance_opt.reference.pool import ReferencePool
 from appearance_opt.reference.subject import Subject
 from appearance_opt.stages import growth
+from appearance_opt.stages.decimated import decimate_start
 from appearance_opt.stages.fitting import POOL_SAMPLES, VALIDATION_VIEWS, fit_policy, point_width
-from appearance_opt.stages.start import Start, make_start
+from appearance_opt.stages.start import Start
 from appearance_opt.views import VALIDATION
 from experiments.common import Placed, asset
 
@@ -119,7 +120,7 @@ def _from_mesh(
     bend: float | None,
 ) -> Case:
     options = simplify_options("default", triangles=triangles, texture_size=TEXTURE, reallocate=0)
-    start = make_start(subject, options, triangles)
+    start = decimate_start(subject, options, triangles)
     if bend is not None:
         start = _bent(start, bend)
     pool = ReferencePool(

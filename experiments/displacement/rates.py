@@ -38,8 +38,8 @@ class Bench:
         from appearance_opt import backend, load, simplify_options
         from appearance_opt.fit.validation import Validation
         from appearance_opt.reference.pool import ReferencePool
+        from appearance_opt.stages.decimated import decimate_start
         from appearance_opt.stages.fitting import point_width
-        from appearance_opt.stages.start import make_start
         from appearance_opt.views import VALIDATION
 
         backend.select("cpu")
@@ -48,7 +48,7 @@ class Bench:
         options = simplify_options(
             triangles=TRIANGLES, displacement=True, subdivision=(LEVEL,), reallocate=0
         )
-        self.start = make_start(placed.subject, options, TRIANGLES)
+        self.start = decimate_start(placed.subject, options, TRIANGLES)
         width = point_width(RESOLUTION, options.texture.size)
         self.pool = ReferencePool(
             reference, sampler, POOL, options.views.per_step, RESOLUTION, 16, width

@@ -18,11 +18,11 @@ from appearance_opt.evaluate.metrics import compare_images
 from appearance_opt.initial.atlas import unwrap
 from appearance_opt.initial.sphere import random_maps
 from appearance_opt.stages import growth
+from appearance_opt.stages.decimated import decimate_start
 from appearance_opt.stages.displacement import gutter
 from appearance_opt.stages.start import (
     Start,
     budget,
-    make_start,
     require_survey,
     transfer_appearance,
 )
@@ -142,7 +142,7 @@ class Bench:
         def make() -> tuple[Start, bool]:
             if texture == first:
                 count = budget(options, self.asset.triangle_count)
-                return make_start(self.placed, options, count), False
+                return decimate_start(self.placed, options, count), False
             mesh = self.start(first).mesh  # the same triangles in another atlas
             other = simplify_options(
                 "default", ratio=self.subject.ratio, steps=0, texture_size=texture

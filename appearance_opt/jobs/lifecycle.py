@@ -1,0 +1,150 @@
+"""How jobs begin and end: what they may write, what they read, the result on disk, the report."""
+
+from __future__ import annotations
+
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from appearance_opt import backend
+from appearance_opt.asset import load, write
+from appearance_opt.interrupts import Interrupts
+from appearance_opt.jobs.paths import level_path
+from appearance_opt.jobs.report import write_job_report
+from appearance_opt.publish import publication
+from appearance_opt.stages.displacement import require_memory
+from appearance_opt.stages.export import write_companion
+from appearance_opt.stages.pair import Pair
+from appearance_opt.stages.parts import split
+from appearance_opt.stages.run import Run, Stopwatch
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Iterator
+
+    from appearance_opt.asset.types import Asset
+    from appearance_opt.config import BakeOptions, CommonOptions, JointOptions
+    from appearance_opt.fit.loop import Progress
+    from appearance_opt.jobs.paths import Outputs
+    from appearance_opt.jobs.result import Result, SimplifyResult
+    from appearance_opt.publish import Publication
+    from appearance_opt.reference.subject import Subject
+
+
+@contextmanager
+def open_run(
+    outputs: Outputs,
+    named: Iterable[object],
+    options: CommonOptions,
+    progress: Progress | None = None,
+    began: float | None = None,
+) -> Iterator[Run]:
+    """A job under way, which alone may write its ``outputs``; they replace none of the files that
+    are ``named``. Raises InputError."""
+    run = Run(
+        Stopwatch(began), options.fit.budget, progress, with_report=outputs.report is not None
+    )
+    outputs.check()
+    outputs.check_sources(*named)
+    with outputs.held(), Interrupts() as run.interrupts:
+        yield run
+
+
+def load_source(
+    source: str | Path | Asset, options: CommonOptions, variants: dict[str, str] | None = None
+) -> Asset:
+    """``source`` itself, or the file of that name, read as the options say."""
+    if not isinstance(source, (str, Path)):
+        return source
+    arguments = options.asset.arguments()
+    return load(source, **{**arguments, "variants": variants or arguments["variants"]})
+
+
+def load_layout(source: str | Path | Asset, options: CommonOptions, missing_textures: str) -> Asset:
+    """The same with vertices and texture coordinates as they are in the file."""
+    if not isinstance(source, (str, Path)):
+        return source
+    o = options.asset
+    return load(
+        source,
+        refine=o.refine,
+        missing_textures=missing_textures,  # type: ignore[arg-type]
+        root=o.root,
+        keep_layout=True,
+    )
+
+
+def name_of(source: str | Path | Asset) -> str:
+    """What to call an input in messages."""
+    return str(source) if isinstance(source, (str, Path)) else source.name
+
+
+def read_pair(
+    high: str | Path | Asset,
+    low: str | Path | Asset,
+    outputs: Outputs,
+    options: BakeOptions | JointOptions,
+    variants: dict[str, str] | None,
+    run: Run,
+) -> Pair:
+    """What of HIGH is baked, and what of LOW it is baked onto. Raises InputError if it is nothing,
+    or if the outputs would replace a file of either."""
+    run.begin("reading both meshes")
+    heavy = load_source(high, options, variants)
+    light = load_layout(low, options, options.asset.missing_textures)
+    outputs.check_inputs(heavy, light)
+    outputs.check_room(light.triangle_count, options)
+    run.lap("load")
+    run.begin(f"preparing {heavy.triangle_count:,} and {light.triangle_count:,} triangles")
+    fitted = split(heavy, f"HIGH, {name_of(high)}", "bake")
+    onto = split(light, f"LOW, {name_of(low)}", "bake onto", False)
+    require_memory(onto.fitted.triangle_count, options)
+    return Pair.of(fitted, onto, name_of(low), options, run)
+
+
+def close_run(
+    run: Run,
+    result: Result,
+    outputs: Outputs,
+    options: CommonOptions,
+    shown: Callable[[], Subject],
+    beside: Callable[[Path, Publication], None] | None = None,
+) -> None:
+    """Write the result with what belongs ``beside`` it, all of it or nothing, then its report.
+
+    ``shown``: what the report compares it with. A fit that diverged is raised between the two: its
+    best state is worth having. A Ctrl-C after the result is written ends the report alone.
+    """
+    if outputs.out is not None:
+        run.begin("writing the result")
+        with publication() as together:
+            write(result.asset, together.place(outputs.out), options.output.for_file(outputs.out))
+            if beside is not None:
+                beside(outputs.out, together)
+        run.lap("write")
+    run.interrupts.release()
+    if result.error is not None:
+        raise result.error
+    if outputs.report is not None:
+        run.begin("drawing the report")
+        result.seconds = dict(run.watch.stages)
+        try:
+            backend.release_memory()
+            write_job_report(outputs.report, result, shown(), options)
+        except KeyboardInterrupt:
+            result.notes.append(
+                "interrupted while the report was made: the result is complete, the report is missing"
+            )
+        run.lap("report")
+    result.seconds = {**run.watch.stages, "total": run.watch.total}
+
+
+def write_levels(
+    result: SimplifyResult, options: CommonOptions, out: Path, together: Publication
+) -> None:
+    """What belongs beside a fitted mesh: its displacement map where the format has no place for
+    it, and tessellated meshes, where they are asked for."""
+    if options.displacement.fitted:
+        write_companion(result.asset, together.place(out))
+    if options.displacement.write_tessellated:
+        for level, asset in result.tessellated.items():
+            write(asset, together.place(level_path(out, level)), options.output.for_file(out))
