@@ -144,7 +144,7 @@ def coverage_derivative(density: float, samples: int) -> tuple[float, float]:
     rendered = gradient.render(drawn, batch, Quality(density, samples, 1), 0)
     by_image = np.zeros((grid.pixels, 4), np.float32)
     by_image[:, 3] = 1
-    gradient.backward(gradient.surrogate(rendered, drawn, mi.Float(by_image.ravel())))
+    gradient.backward(gradient.surrogate(rendered, drawn.shown, mi.Float(by_image.ravel())))
     edge = float(np.array(dr.grad(positions)).astype(np.float64) @ start)
     areas = []
     for scale in (1.02, 0.98):
@@ -336,7 +336,7 @@ def test_pixels_shaded_with_their_loss_have_the_gradient_of_the_whole_image(
     target = Target.of(inputs.reference.average, inputs.background)
     pixels = compared_pixels(rendered.image, target)
     whole, by_image = image_loss(loss, target, rendered.image, pixels, grid.pixels)
-    gradient.backward(gradient.surrogate(rendered, drawn, by_image))
+    gradient.backward(gradient.surrogate(rendered, drawn.shown, by_image))
     slow = model.gradients(tracked, model.values())
     assert (value is not None) == want_loss
     if value is not None:

@@ -66,7 +66,7 @@ def pulled(
 ) -> np.ndarray:
     """dLoss/dPositions, for dLoss/dImage (pixels, 4)."""
     flat = mi.Float(by_image.astype(np.float32).ravel())
-    gradient.backward(gradient.surrogate(rendered, drawn, flat))
+    gradient.backward(gradient.surrogate(rendered, drawn.shown, flat))
     return np.array(dr.grad(positions)).reshape(-1, 3).astype(np.float64)
 
 

@@ -77,7 +77,7 @@ def test_silhouettes_carry_the_derivative_of_the_area_that_is_seen_of_fronts(
     rendered = gradient.render(drawn, batch, quality, 0)
     by = np.zeros((grid.pixels, 4), np.float32)
     by[:, 3] = weight
-    gradient.backward(gradient.surrogate(rendered, drawn, mi.Float(by.ravel())))
+    gradient.backward(gradient.surrogate(rendered, drawn.shown, mi.Float(by.ravel())))
     analytic = np.array(dr.grad(positions)).astype(np.float64)
     rng = np.random.default_rng(1)
     # growing, moving and turning about, and what random vertices add to it

@@ -12,7 +12,7 @@ import numpy as np
 from appearance_opt.fit import adam
 from appearance_opt.fit.losses import Target, compared_pixels, covered_loss, image_loss
 from appearance_opt.render import gradient
-from appearance_opt.render.drawn import Drawn
+from appearance_opt.render.drawn import Shown
 from appearance_opt.render.freezing import Frozen, traced
 from appearance_opt.render.pixels import Batch
 
@@ -112,7 +112,6 @@ class Gradients:
             pose,
             stored,
             decoded,
-            drawn,
             rendered,
             by_image,
             target if points is None else replace(target, reference=points),
@@ -138,7 +137,6 @@ class Gradients:
         pose: Pose,
         stored: Values,
         decoded: Decoded,
-        drawn: Drawn,
         rendered: gradient.RenderedBatch,
         by_image: mi.Float,
         target: Target,
@@ -150,13 +148,13 @@ class Gradients:
         tracked = latent.track(decoded)
         vertices = latent.vertices(tracked, pose)
         surface = latent.surface(vertices, pose)
-        drawn = replace(drawn, surface=surface, maps=latent.maps(tracked))
+        shown = Shown(surface, latent.maps(tracked), self._edges[pose.level])
 
         def pixel_loss(color: mi.Color3f, pixel: mi.UInt32) -> mi.Float:
             return covered_loss(self.loss, target, color, pixel)
 
-        terms = gradient.surrogate(rendered, drawn, by_image)
-        direct = gradient.direct(rendered, drawn, pixel_loss)
+        terms = gradient.surrogate(rendered, shown, by_image)
+        direct = gradient.direct(rendered, shown, pixel_loss)
         if direct is not None:
             terms.append(direct)
         if dr.grad_enabled(vertices) and pose.level in self.laplacians:

@@ -21,10 +21,20 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, eq=False)
+class Shown:
+    """What is seen, as far as no ray is traced: the ``surface``, its materials ``maps``, and its
+    ``edges`` where derivatives at silhouettes are wanted, else None. Surface and maps may carry
+    gradients."""
+
+    surface: Surface
+    maps: MaterialMaps
+    edges: EdgeList | None = None
+
+
+@dataclass(frozen=True, eq=False)
 class Drawn:
     """Everything that an image shows. ``scene``, in which rays are traced, and ``surface``, which
-    is drawn and shaded, are the same mesh at the same place. ``maps``: its materials. ``edges``:
-    its edges, where derivatives at silhouettes are wanted; None elsewhere."""
+    is drawn and shaded, are the same mesh at the same place. See ``Shown`` for the rest."""
 
     scene: mi.Scene | SidedScene
     surface: Surface
@@ -36,3 +46,9 @@ class Drawn:
         """Upload a mesh that stands still."""
         scene = upload.scene_of(mesh.positions, mesh.faces, mesh.culled)
         return cls(scene, upload.surface_of(mesh), maps)
+
+    @property
+    def shown(self) -> Shown:
+        """What stages that trace no ray are handed: the scene costs time in every call of a
+        recorded one."""
+        return Shown(self.surface, self.maps, self.edges)

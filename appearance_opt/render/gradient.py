@@ -36,7 +36,7 @@ from appearance_opt.render.visibility import see_grid
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from appearance_opt.render.drawn import Drawn
+    from appearance_opt.render.drawn import Drawn, Shown
     from appearance_opt.render.freezing import Run
 
 
@@ -115,7 +115,7 @@ def render(
         # pairs blend what few rays miss; elsewhere the silhouette's line knows it
         corrected = quality.edge_samples if quality.visibility == "edges" else None
         image, contrast, met_contrast = run(
-            _averages, drawn, batch, averaged, edges, met, width, corrected
+            _averages, drawn.shown, batch, averaged, edges, met, width, corrected
         )
         dr.eval(image, contrast, met_contrast)
     return RenderedBatch(
@@ -124,7 +124,7 @@ def render(
 
 
 def _averages(
-    drawn: Drawn,
+    shown: Shown,
     batch: Batch,
     averaged: Weighted | None,
     edges: EdgeSamples | None,
@@ -138,11 +138,11 @@ def _averages(
     image = dr.zeros(mi.Float, batch.grid.pixels * 4)
     if averaged is not None:
         w = averaged.weight
-        c = shade(drawn, batch, averaged.samples, averaged.width)
+        c = shade(shown, batch, averaged.samples, averaged.width)
         value = mi.ArrayXf([c.x * w, c.y * w, c.z * w, w])
         dr.scatter_reduce(dr.ReduceOp.Add, image, value, averaged.pixel, mode=dr.ReduceMode.Local)
     contrast, met_contrast = (
-        None if b is None else _contrast(drawn, batch, b.inside, b.outside, width)
+        None if b is None else _contrast(shown, batch, b.inside, b.outside, width)
         for b in (edges, met)
     )
     if edges is not None and corrected is not None:
@@ -154,7 +154,7 @@ def _averages(
 
 def direct(
     rendered: RenderedBatch,
-    drawn: Drawn,
+    shown: Shown,
     pixel_loss: Callable[[mi.Color3f, mi.UInt32], mi.Float],
 ) -> mi.Float | None:
     """Loss of each deferred pixel, differentiable: ``pixel_loss(radiance, pixel)`` of its radiance
@@ -162,11 +162,11 @@ def direct(
     if rendered.deferred is None:
         return None
     d = rendered.deferred
-    colors = [shade(drawn, rendered.batch, r, d.width) for r in d.rays]
+    colors = [shade(shown, rendered.batch, r, d.width) for r in d.rays]
     return pixel_loss(sum(colors[1:], colors[0]) * (1 / len(colors)), d.pixel)
 
 
-def surrogate(rendered: RenderedBatch, drawn: Drawn, image_gradient: mi.Float) -> list[mi.Float]:
+def surrogate(rendered: RenderedBatch, shown: Shown, image_gradient: mi.Float) -> list[mi.Float]:
     """Arrays whose sums have the loss's derivative, for ``image_gradient`` = dLoss/dImage (pixels *
     4).
 
@@ -176,17 +176,17 @@ def surrogate(rendered: RenderedBatch, drawn: Drawn, image_gradient: mi.Float) -
     terms, batch = [], rendered.batch
     if rendered.averaged is not None:
         a = rendered.averaged
-        color = shade(drawn, batch, a.samples, a.width)
+        color = shade(shown, batch, a.samples, a.width)
         g = _pixel(image_gradient, a.pixel)
         terms.append(dr.fma(g[0], color.x, dr.fma(g[1], color.y, g[2] * color.z)) * a.weight)
-    if drawn.edges is None or not dr.grad_enabled(drawn.surface.vertices):
+    if shown.edges is None or not dr.grad_enabled(shown.surface.vertices):
         return terms
     if (points := rendered.edges) is not None:
         jump = _jump(image_gradient, points.pixel, rendered.contrast)
-        terms.append(jump * points.length * silhouette.motion(drawn, batch, points))
+        terms.append(jump * points.length * silhouette.motion(shown, batch, points))
     if (met := rendered.intersections) is not None:
         jump = _jump(image_gradient, met.pixel, rendered.intersections_contrast)
-        terms.append(jump * met.area * intersections.motion(drawn, batch, met))
+        terms.append(jump * met.area * intersections.motion(shown, batch, met))
     return terms
 
 
@@ -284,14 +284,14 @@ def _merge_weighted(
 
 
 def _contrast(
-    drawn: Drawn, batch: Batch, inside: Samples, outside: Samples, width: mi.Float
+    shown: Shown, batch: Batch, inside: Samples, outside: Samples, width: mi.Float
 ) -> mi.ArrayXf:
     """c_in - c_out of samples on the two sides of boundaries: premultiplied RGB and coverage."""
 
     def seen(side: Samples) -> mi.ArrayXf:
         covered = side.triangle != MISS
         hits = Samples(side.view, side.x, side.y, dr.select(covered, side.triangle, 0))
-        color = shade(drawn, batch, hits, width) & covered
+        color = shade(shown, batch, hits, width) & covered
         return mi.ArrayXf([color.x, color.y, color.z, dr.select(covered, mi.Float(1), 0)])
 
     return seen(inside) - seen(outside)

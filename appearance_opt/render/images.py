@@ -17,7 +17,7 @@ from appearance_opt.render.shading import shade
 from appearance_opt.render.visibility import Visible, see_grid
 
 if TYPE_CHECKING:
-    from appearance_opt.render.drawn import Drawn
+    from appearance_opt.render.drawn import Drawn, Shown
     from appearance_opt.render.freezing import Run
     from appearance_opt.render.pixels import Batch
     from appearance_opt.render.samples import Samples
@@ -82,7 +82,7 @@ def add_first(
     """Of opaque surfaces: what rays meet first. See ``Resolve``."""
     shaded = seen.samples, dr.compress(seen.hit)
     # one sample per pixel: no two threads meet
-    return _add_shaded(image, drawn, batch, shaded, footprint, dr.ReduceMode.NoConflicts, run)
+    return _add_shaded(image, drawn.shown, batch, shaded, footprint, dr.ReduceMode.NoConflicts, run)
 
 
 def render_image(
@@ -125,7 +125,7 @@ def render_pair(
         fine, hit = rays.trace_pixels(drawn.scene, batch, index, samples, run)
         footprint, mode = Footprint.of(samples, samples**-0.5), dr.ReduceMode.Local
         shaded = fine, dr.compress(hit)
-        average = _add_shaded(average, drawn, batch, shaded, footprint, mode, run)
+        average = _add_shaded(average, drawn.shown, batch, shaded, footprint, mode, run)
     return average, points
 
 
@@ -143,7 +143,7 @@ def _without_outlines(points: mi.Float, seen: Visible, batch: Batch) -> tuple[mi
 
 def _add_shaded(
     image: mi.Float,
-    drawn: Drawn,
+    shown: Shown,
     batch: Batch,
     shaded: tuple[Samples, mi.UInt32],
     footprint: Footprint,
@@ -154,21 +154,21 @@ def _add_shaded(
     in their list of those that count."""
     if dr.width(shaded[1]) == 0:
         return image
-    out = run(_accumulate, image, drawn, batch, shaded, footprint, mode)
+    out = run(_accumulate, image, shown, batch, shaded, footprint, mode)
     dr.eval(out)
     return out
 
 
 def _accumulate(
     image: mi.Float,
-    drawn: Drawn,
+    shown: Shown,
     batch: Batch,
     shaded: tuple[Samples, mi.UInt32],
     footprint: Footprint,
     mode: dr.ReduceMode,
 ) -> mi.Float:
     some = shaded[0].keep(shaded[1])
-    color, weight = shade(drawn, batch, some, footprint.width), footprint.weight
+    color, weight = shade(shown, batch, some, footprint.width), footprint.weight
     value = mi.ArrayXf([color.x * weight, color.y * weight, color.z * weight, weight])
     out = mi.Float(image)
     pixel = pixel_index(some, batch.grid.rows)

@@ -14,7 +14,7 @@ import drjit as dr
 import mitsuba as mi
 
 from appearance_opt.render.camera import Camera, camera_of, direction
-from appearance_opt.render.drawn import Drawn
+from appearance_opt.render.drawn import Shown
 from appearance_opt.render.math import clamp
 from appearance_opt.render.pixels import Batch
 from appearance_opt.render.samples import Samples
@@ -46,17 +46,17 @@ class Intersections:
     pixel: mi.UInt32
 
 
-def find(drawn: Drawn, batch: Batch, pairs: Neighbours) -> Intersections | None:
+def find(shown: Shown, batch: Batch, pairs: Neighbours) -> Intersections | None:
     """The crossings between samples whose sheets go on under each other. None without any. ``area``
     and ``pixel`` are left to the caller."""
     front, back = pairs.front, pairs.back
     camera = camera_of(batch.records, front.view)
-    first, last = _differences(drawn, batch, front, back)
-    one, other = (_slope(_plane(drawn, camera, s.triangle), camera) for s in (front, back))
+    first, last = _differences(shown, batch, front, back)
+    one, other = (_slope(_plane(shown, camera, s.triangle), camera) for s in (front, back))
     dx, dy = dr.abs(one[0] - other[0]), dr.abs(one[1] - other[1])
     ours = dr.select(pairs.horizontal, dx >= dy, dy > dx)
     ray = direction(camera, front.x, front.y, batch.grid.size)
-    inverse_depth = dr.abs(dr.dot(_plane(drawn, camera, front.triangle), ray))
+    inverse_depth = dr.abs(dr.dot(_plane(shown, camera, front.triangle), ray))
     steep = first - last > FLATTEST * inverse_depth
     kept = dr.compress(ours & steep & (first > 0) & (last < 0))
     if dr.width(kept) == 0:
@@ -66,21 +66,21 @@ def find(drawn: Drawn, batch: Batch, pairs: Neighbours) -> Intersections | None:
     return Intersections(p.front, p.back, p.horizontal, position, mi.Float(1), mi.UInt32(0))
 
 
-def motion(drawn: Drawn, batch: Batch, found: Intersections) -> mi.Float:
+def motion(shown: Shown, batch: Batch, found: Intersections) -> mi.Float:
     """Position of each crossing in units of the samples' distance, differentiable in the
     vertices."""
-    first, last = _differences(drawn, batch, found.inside, found.outside)
+    first, last = _differences(shown, batch, found.inside, found.outside)
     return first / (first - last)
 
 
 def _differences(
-    drawn: Drawn, batch: Batch, front: Samples, back: Samples
+    shown: Shown, batch: Batch, front: Samples, back: Samples
 ) -> tuple[mi.Float, mi.Float]:
     """Reciprocal depth of the front samples' triangles less that of the back samples', at the front
     samples and at the back samples. The planes that are seen stand for their sheets: hidden
     triangles can be edge-on."""
     camera = camera_of(batch.records, front.view)
-    planes = [_plane(drawn, camera, s.triangle) for s in (front, back)]
+    planes = [_plane(shown, camera, s.triangle) for s in (front, back)]
     rays = [direction(camera, s.x, s.y, batch.grid.size) for s in (front, back)]
     first, last = (dr.dot(planes[0], ray) - dr.dot(planes[1], ray) for ray in rays)
     return first, last
@@ -92,12 +92,12 @@ def _slope(plane: mi.Vector3f, camera: Camera) -> tuple[mi.Float, mi.Float]:
     return dr.dot(plane, camera.right), dr.dot(plane, camera.down)
 
 
-def _plane(drawn: Drawn, camera: Camera, triangle: mi.UInt32) -> mi.Vector3f:
+def _plane(shown: Shown, camera: Camera, triangle: mi.UInt32) -> mi.Vector3f:
     """The vector whose product with a ray's direction is the reciprocal depth of the triangle's
     plane along it."""
-    around = edges_of(drawn).around
+    around = edges_of(shown).around
     face = dr.gather(mi.ArrayXu, around, triangle, shape=(12, dr.width(triangle)))
-    a, b, c = (vertex_position(drawn.surface, face[k]) for k in range(3))
+    a, b, c = (vertex_position(shown.surface, face[k]) for k in range(3))
     n = dr.cross(b - a, c - a)
     height = dr.dot(n, a - camera.eye)
     return n / dr.select(dr.abs(height) > 1e-30, height, 1e-30)

@@ -27,9 +27,10 @@ from appearance_opt.render.surface import interpolate
 from appearance_opt.render.visibility import Visible
 
 if TYPE_CHECKING:
-    from appearance_opt.render.drawn import Drawn
+    from appearance_opt.render.drawn import Drawn, Shown
     from appearance_opt.render.freezing import Run
     from appearance_opt.render.images import Footprint
+    from appearance_opt.render.passing import Scene
     from appearance_opt.render.pixels import Batch
     from appearance_opt.render.surface import Hit
 
@@ -96,7 +97,7 @@ class SeenThrough:
     ) -> mi.Float:
         """All layers along the rays, from the eye on; see ``images.Resolve``. Rays whose light is
         used up take no part in further layers."""
-        light = dr.ones(mi.Float, dr.width(seen.depth))
+        shown, light = drawn.shown, dr.ones(mi.Float, dr.width(seen.depth))
         dr.eval(light)
         for _ in range(MOST):
             going = dr.compress(seen.hit & (light >= LEAST))
@@ -104,22 +105,22 @@ class SeenThrough:
                 break
             seen, light = seen.keep(going), dr.gather(mi.Float, light, going)
             dr.eval(seen, light)
-            share = run(_kept_back, drawn, batch, self.coverage, seen.samples, light, footprint)
+            share = run(_kept_back, shown, batch, self.coverage, seen.samples, light, footprint)
             dr.eval(share)
-            image = _blend(image, drawn, batch, seen.samples, share, footprint, run)
+            image = _blend(image, shown, batch, seen.samples, share, footprint, run)
             light = light - share
             left = dr.compress(light >= LEAST)
             if dr.width(left) == 0:
                 break
             seen, light = seen.keep(left), dr.gather(mi.Float, light, left)
             dr.eval(seen, light)
-            seen = run(_behind, drawn, batch, seen)
+            seen = run(_behind, drawn.scene, batch, seen)
             dr.eval(seen)
         return image
 
 
 def _kept_back(
-    drawn: Drawn,
+    shown: Shown,
     batch: Batch,
     coverage: Coverage,
     hits: Samples,
@@ -128,13 +129,13 @@ def _kept_back(
 ) -> mi.Float:
     """What hits keep back of the ``light`` of their rays."""
     camera = camera_of(batch.records, hits.view)
-    hit = interpolate(drawn.surface, camera, hits, batch.grid.size, footprint.width)
+    hit = interpolate(shown.surface, camera, hits, batch.grid.size, footprint.width)
     return coverage.at(hit) * light
 
 
 def _blend(
     image: mi.Float,
-    drawn: Drawn,
+    shown: Shown,
     batch: Batch,
     hits: Samples,
     share: mi.Float,
@@ -146,21 +147,21 @@ def _blend(
     index = dr.compress(share > 0)
     if dr.width(index) == 0:
         return image
-    image = run(_accumulate, image, drawn, batch, (hits, index), share, footprint)
+    image = run(_accumulate, image, shown, batch, (hits, index), share, footprint)
     dr.eval(image)
     return image
 
 
 def _accumulate(
     image: mi.Float,
-    drawn: Drawn,
+    shown: Shown,
     batch: Batch,
     shaded: tuple[Samples, mi.UInt32],
     share: mi.Float,
     footprint: Footprint,
 ) -> mi.Float:
     some = shaded[0].keep(shaded[1])
-    color = shade(drawn, batch, some, footprint.width)
+    color = shade(shown, batch, some, footprint.width)
     part = dr.gather(mi.Float, share, shaded[1]) * footprint.weight
     out = mi.Float(image)
     value = mi.ArrayXf([color.x * part, color.y * part, color.z * part, part])
@@ -169,13 +170,13 @@ def _accumulate(
     return out
 
 
-def _behind(drawn: Drawn, batch: Batch, seen: Visible) -> Visible:
+def _behind(scene: Scene, batch: Batch, seen: Visible) -> Visible:
     """What the rays meet next."""
     hits = seen.samples
     camera = camera_of(batch.records, hits.view)
     d = direction(camera, hits.x, hits.y, batch.grid.size)
     length = dr.norm(d)
     ray = mi.Ray3f(camera.eye, d / length)
-    met = meet(drawn.scene, ray, after=seen.depth * length, coherent=True)
+    met = meet(scene, ray, after=seen.depth * length, coherent=True)
     samples = Samples(hits.view, hits.x, hits.y, met.triangle)
     return Visible(samples, met.t / length, met.triangle != MISS)

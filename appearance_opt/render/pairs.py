@@ -43,7 +43,7 @@ from appearance_opt.render.silhouette import EdgeSamples, edges_of, gather_edges
 from appearance_opt.render.silhouette_walk import Neighbours, choose, neighbours, walk
 
 if TYPE_CHECKING:
-    from appearance_opt.render.drawn import Drawn
+    from appearance_opt.render.drawn import Drawn, Shown
     from appearance_opt.render.freezing import Run
     from appearance_opt.render.quality import Quality
 
@@ -104,7 +104,7 @@ def paired_samples(
     fine = _Fine.of(batch, isqrt(quality.samples))
     hits, depth = run(rays.trace_grid, drawn.scene, fine.samples)
     dr.eval(hits, depth)
-    found = find_pairs(drawn, hits, depth, fine, run)
+    found = find_pairs(drawn.shown, hits, depth, fine, run)
     received = dr.zeros(mi.Float, fine.samples.grid.pixels)
     if found is not None:
         dr.scatter_reduce(dr.ReduceOp.Add, received, found.weight, found.receiver)
@@ -126,7 +126,7 @@ def find_intersections(
     fine = _Fine.of(batch, per_axis)
     hits, depth = run(rays.trace_grid, drawn.scene, fine.samples)
     dr.eval(hits, depth)
-    found = find_pairs(drawn, hits, depth, fine, run)
+    found = find_pairs(drawn.shown, hits, depth, fine, run)
     return None if found is None else found.intersections
 
 
@@ -181,14 +181,14 @@ def _weights(
 
 
 def find_pairs(
-    drawn: Drawn, hits: Samples, depth: mi.Float, fine: _Fine, run: Run = traced
+    shown: Shown, hits: Samples, depth: mi.Float, fine: _Fine, run: Run = traced
 ) -> Pairs | None:
     """The pairs among ``hits``, one sample in every pixel of the finer grid. None without any."""
-    assert edges_of(drawn).around is not None, "pairs walk over the mesh: use walkable edges"
+    assert edges_of(shown).around is not None, "pairs walk over the mesh: use walkable edges"
     every = neighbours(hits, depth, fine.samples.grid)
     if every is None:
         return None
-    edge, covers = run(walk, drawn, fine.samples, every)
+    edge, covers = run(walk, shown, fine.samples, every)
     kept = dr.compress(edge != MISS)
     outlines = [(every.keep(kept), dr.gather(mi.UInt32, edge, kept))]
     # the front sheet goes on under the back sample without being seen there: the back sheet lies
@@ -199,12 +199,12 @@ def find_pairs(
     met = None
     if dr.width(under):
         other = every.keep(under).swapped()
-        edge, returns = run(walk, drawn, fine.samples, other)
+        edge, returns = run(walk, shown, fine.samples, other)
         kept = dr.compress(edge != MISS)
         outlines.append((other.keep(kept), dr.gather(mi.UInt32, edge, kept)))
         kept = dr.compress((returns != MISS) & (returns != other.back.triangle))
         if dr.width(kept):
-            met = intersections.find(drawn, fine.samples, other.keep(kept).swapped())
+            met = intersections.find(shown, fine.samples, other.keep(kept).swapped())
     parts: list[tuple] = []
     points = None
     outlines = [o for o in outlines if o[0].width]
@@ -217,7 +217,7 @@ def find_pairs(
                 join_arrays([outlines[0][1], outlines[1][1]]),
             )
         )
-        points, d = _outline_points(drawn, edge, pairs, fine)
+        points, d = _outline_points(shown, edge, pairs, fine)
         points.pixel, *blended = _blend(pairs, d, fine)
         parts.append((points.pixel, *blended))
     if met is not None:
@@ -252,12 +252,12 @@ def _blend(
 
 
 def _outline_points(
-    drawn: Drawn, edge: mi.UInt32, pairs: Neighbours, fine: _Fine
+    shown: Shown, edge: mi.UInt32, pairs: Neighbours, fine: _Fine
 ) -> tuple[EdgeSamples, mi.Float]:
     """(silhouette points without their pixels, distances from the front samples): where ``edge``
     crosses segments."""
     front, back, horizontal = pairs.front, pairs.back, pairs.horizontal
-    ends, batch = gather_edges(drawn, edge), fine.samples
+    ends, batch = gather_edges(shown, edge), fine.samples
     camera = camera_of(batch.records, front.view)
     ax, ay, _ = project(camera, ends.a, batch.grid.size)
     bx, by, _ = project(camera, ends.b, batch.grid.size)

@@ -17,7 +17,7 @@ from appearance_opt.render.math import at_least
 from appearance_opt.render.surface import interpolate
 
 if TYPE_CHECKING:
-    from appearance_opt.render.drawn import Drawn
+    from appearance_opt.render.drawn import Shown
     from appearance_opt.render.pixels import Batch
     from appearance_opt.render.samples import Samples
 
@@ -26,12 +26,12 @@ NEAREST_LIGHT = 1e-3
 that touches a surface is infinitely bright there."""
 
 
-def shade(drawn: Drawn, batch: Batch, samples: Samples, width: mi.Float) -> mi.Color3f:
+def shade(shown: Shown, batch: Batch, samples: Samples, width: mi.Float) -> mi.Color3f:
     """Radiance towards the camera at each sample (all must be hits). Linear RGB. ``width``: width
     of a sample in pixels, which selects the mip level."""
     camera = camera_of(batch.records, samples.view)
-    hit = interpolate(drawn.surface, camera, samples, batch.grid.size, width)
-    sample = material.evaluate(drawn.maps, hit)
+    hit = interpolate(shown.surface, camera, samples, batch.grid.size, width)
+    sample = material.evaluate(shown.maps, hit)
     if sample.unlit is True:
         return sample.base_color
     normal = material.shading_normal(hit, sample)

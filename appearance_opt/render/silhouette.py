@@ -30,7 +30,7 @@ from appearance_opt.render.surface import vertex_position
 
 if TYPE_CHECKING:
     from appearance_opt.render.camera import Camera
-    from appearance_opt.render.drawn import Drawn
+    from appearance_opt.render.drawn import Drawn, Shown
     from appearance_opt.render.freezing import Run
     from appearance_opt.render.pixels import Batch
 
@@ -99,36 +99,36 @@ class GatheredEdges:
     b: mi.Point3f
 
 
-def gather_edges(drawn: Drawn, index: mi.UInt32, active: mi.Bool | bool = True) -> GatheredEdges:
+def gather_edges(shown: Shown, index: mi.UInt32, active: mi.Bool | bool = True) -> GatheredEdges:
     """The edges of the given numbers; differentiable in the vertices."""
-    edges = edges_of(drawn)
+    edges = edges_of(shown)
     corners = dr.gather(mi.ArrayXu, edges.packets, index, active, shape=(4, dr.width(index)))
-    a, b = (vertex_position(drawn.surface, corners[k]) for k in (0, 1))
+    a, b = (vertex_position(shown.surface, corners[k]) for k in (0, 1))
     return GatheredEdges(index, corners, a, b)
 
 
-def edges_of(drawn: Drawn) -> EdgeList:
+def edges_of(shown: Shown | Drawn) -> EdgeList:
     """The edges of what is drawn, which must have some."""
-    assert drawn.edges is not None, "silhouettes need the edges of what is drawn"
-    return drawn.edges
+    assert shown.edges is not None, "silhouettes need the edges of what is drawn"
+    return shown.edges
 
 
 def silhouette_edges(drawn: Drawn, batch: Batch, run: Run = traced) -> tuple[mi.UInt32, mi.Float]:
     """(index, length): the silhouettes among all pairs (view * edges + edge), and their projected
     lengths in pixels."""
-    visible, length = run(_candidates, drawn, batch)
+    visible, length = run(_candidates, drawn.shown, batch)
     index = dr.compress(visible)
     return index, dr.gather(mi.Float, length, index)
 
 
-def _candidates(drawn: Drawn, batch: Batch) -> tuple[mi.Bool, mi.Float]:
+def _candidates(shown: Shown, batch: Batch) -> tuple[mi.Bool, mi.Float]:
     """(silhouette and in view, projected length) of all pairs (view * edges + edge)."""
-    count, size = edges_of(drawn).count, batch.grid.size
+    count, size = edges_of(shown).count, batch.grid.size
     i = dr.arange(mi.UInt32, batch.grid.views * count)
     view = i // count
-    edge = gather_edges(drawn, i - view * count)
+    edge = gather_edges(shown, i - view * count)
     camera = camera_of(batch.records, view)
-    silhouette = is_silhouette(drawn, edge, camera)
+    silhouette = is_silhouette(shown, edge, camera)
     ax, ay, az = project(camera, edge.a, size)
     bx, by, bz = project(camera, edge.b, size)
     length = dr.sqrt(dr.square(bx - ax) + dr.square(by - ay))
@@ -139,16 +139,16 @@ def _candidates(drawn: Drawn, batch: Batch) -> tuple[mi.Bool, mi.Float]:
     return visible, length
 
 
-def is_silhouette(drawn: Drawn, edge: GatheredEdges, camera: Camera) -> mi.Bool:
+def is_silhouette(shown: Shown, edge: GatheredEdges, camera: Camera) -> mi.Bool:
     """Do both faces of edges lie on one side of the plane through eye and edge? No winding is
     needed, but for culled faces: what turns its back to the eye is not there."""
     m = dr.cross(edge.a - camera.eye, edge.b - edge.a)
     side, other_side = (
-        dr.dot(m, vertex_position(drawn.surface, edge.corners[k]) - edge.a) for k in (2, 3)
+        dr.dot(m, vertex_position(shown.surface, edge.corners[k]) - edge.a) for k in (2, 3)
     )
     boundary = edge.corners[3] == edge.corners[1]
     out = boundary | (side * other_side > 0)
-    sides = edges_of(drawn).sides
+    sides = edges_of(shown).sides
     if sides is None:
         return out
     bits = dr.gather(mi.UInt32, sides, edge.index)
@@ -203,7 +203,8 @@ def _points(
     drawn: Drawn, batch: Batch, strata: Strata, number: mi.UInt32, seed: mi.UInt32
 ) -> tuple[EdgeSamples, mi.Bool]:
     """The points of the given numbers along the silhouettes, and whether each is visible."""
-    count, size, rows = edges_of(drawn).count, batch.grid.size, batch.grid.rows
+    shown, size, rows = drawn.shown, batch.grid.size, batch.grid.rows
+    count = edges_of(shown).count
     at = (mi.Float64(number) + mi.Float64(mi.sample_tea_float32(number, seed))) * strata.spacing
     found = _first_not_below(strata.upper, at, strata.last, batch.grid.views * count)
     pair = dr.gather(mi.UInt32, strata.index, found)
@@ -211,12 +212,12 @@ def _points(
     s = mi.Float((at - begin) / (dr.gather(mi.Float64, strata.upper, found) - begin))
     s = dr.select((s > 0) & (s < 1), s, 0.5)
     view = pair // count
-    edge = gather_edges(drawn, pair - view * count)
+    edge = gather_edges(shown, pair - view * count)
     camera = camera_of(batch.records, view)
     ax, ay, az = project(camera, edge.a, size)
     bx, by, bz = project(camera, edge.b, size)
-    opposite = _seen_opposite(drawn, edge, camera)
-    ox, oy, oz = project(camera, vertex_position(drawn.surface, opposite), size)
+    opposite = _seen_opposite(shown, edge, camera)
+    ox, oy, oz = project(camera, vertex_position(shown.surface, opposite), size)
     nx, ny = ay - by, bx - ax
     scale = dr.rsqrt(dr.fma(nx, nx, ny * ny))
     # outward: away from the third vertex of a face that is there; one behind the camera is
@@ -242,13 +243,13 @@ def _points(
     ), visible
 
 
-def _seen_opposite(drawn: Drawn, edge: GatheredEdges, camera: Camera) -> mi.UInt32:
+def _seen_opposite(shown: Shown, edge: GatheredEdges, camera: Camera) -> mi.UInt32:
     """The opposite vertex of a face of each silhouette that is not culled."""
-    sides = edges_of(drawn).sides
+    sides = edges_of(shown).sides
     if sides is None:
         return edge.corners[2]
     m = dr.cross(edge.a - camera.eye, edge.b - edge.a)
-    side = dr.dot(m, vertex_position(drawn.surface, edge.corners[2]) - edge.a)
+    side = dr.dot(m, vertex_position(shown.surface, edge.corners[2]) - edge.a)
     away = _turned_away(dr.gather(mi.UInt32, sides, edge.index), side)
     return dr.select(away, edge.corners[3], edge.corners[2])
 
@@ -268,10 +269,10 @@ def _first_not_below(
     return found
 
 
-def motion(drawn: Drawn, batch: Batch, samples: EdgeSamples) -> mi.Float:
+def motion(shown: Shown, batch: Batch, samples: EdgeSamples) -> mi.Float:
     """n . x(theta): the position of each point along its outward normal in pixels, differentiable
     in the vertices. Only its derivative means anything."""
-    edge, camera = gather_edges(drawn, samples.edge), camera_of(batch.records, samples.view)
+    edge, camera = gather_edges(shown, samples.edge), camera_of(batch.records, samples.view)
     ax, ay, _ = project(camera, edge.a, batch.grid.size)
     bx, by, _ = project(camera, edge.b, batch.grid.size)
     x, y = dr.lerp(ax, bx, samples.position), dr.lerp(ay, by, samples.position)

@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 
 from appearance_opt.render.camera import camera_of, project
-from appearance_opt.render.drawn import Drawn
+from appearance_opt.render.drawn import Shown
 from appearance_opt.render.outlines import NOTHING
 from appearance_opt.render.passing import MISS
 from appearance_opt.render.pixels import Batch, Grid, pixel_index
@@ -93,13 +93,13 @@ def choose(condition: mi.Bool, one: Samples, other: Samples) -> Samples:
     return Samples(one.view, *fields)
 
 
-def walk(drawn: Drawn, batch: Batch, pairs: Neighbours) -> tuple[mi.UInt32, mi.UInt32]:
+def walk(shown: Shown, batch: Batch, pairs: Neighbours) -> tuple[mi.UInt32, mi.UInt32]:
     """(silhouette edge, triangle): where the lines from front to back samples leave the sheet that
     the front sample sees. From triangle to triangle, each left by the last of its edges along the
     line. Either a silhouette is met before the back sample, which is an edge if it is one of this
     kind of pair's (steeper than 45 degrees for those beside each other, flatter for the others), or
     the sheet covers the back sample, with that triangle; what is not there is MISS."""
-    around = edges_of(drawn).around
+    around = edges_of(shown).around
     front, back, horizontal = pairs.front, pairs.back, pairs.horizontal
     count = pairs.width
     start_along, line = (
@@ -114,7 +114,7 @@ def walk(drawn: Drawn, batch: Batch, pairs: Neighbours) -> tuple[mi.UInt32, mi.U
         here = dr.gather(mi.ArrayXu, around, face, walking, shape=(12, count))
         camera = camera_of(batch.records, front.view)
         projected = [
-            project(camera, vertex_position(drawn.surface, here[k]), batch.grid.size)
+            project(camera, vertex_position(shown.surface, here[k]), batch.grid.size)
             for k in range(3)
         ]
         walking &= (projected[0][2] > 0) & (projected[1][2] > 0) & (projected[2][2] > 0)
@@ -138,9 +138,9 @@ def walk(drawn: Drawn, batch: Batch, pairs: Neighbours) -> tuple[mi.UInt32, mi.U
         walking &= leaves != MISS
         covers = dr.select(walking & (furthest > 1), face, covers)
         walking &= furthest <= 1
-        edge = gather_edges(drawn, leaves, walking)
+        edge = gather_edges(shown, leaves, walking)
         edge.index = dr.select(walking, leaves, 0)
-        ends = walking & is_silhouette(drawn, edge, camera)
+        ends = walking & is_silhouette(shown, edge, camera)
         found = dr.select(ends & ours, leaves, found)
         walking &= ~ends
         return dr.select(walking, beyond, face), walking, steps + 1, found, covers

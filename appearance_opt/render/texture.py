@@ -24,20 +24,38 @@ if TYPE_CHECKING:
 REPEAT, CLAMP, MIRROR = 0, 1, 2
 
 
-@dataclass(frozen=True)
 class PyramidLayout:
     """Where each mip level of each material starts.
 
     ``sizes[m][k]`` is the (width, height) of level k of material m in texels, ``offsets[m][k]`` its
     first texel in the flat buffer. Every material lists the same number of levels (small ones
-    repeat their last), so that (material, level) is one index into the table.
+    repeat their last), so that (material, level) is one index into the table. A plain class, told
+    apart by its hash: Dr.Jit visits every number in a data class whenever a recorded function is
+    called.
     """
 
-    channels: int
-    sizes: tuple[tuple[tuple[int, int], ...], ...]
-    offsets: tuple[tuple[int, ...], ...]
-    wraps: tuple[int, ...]
-    texel_count: int
+    def __init__(
+        self,
+        channels: int,
+        sizes: tuple[tuple[tuple[int, int], ...], ...],
+        offsets: tuple[tuple[int, ...], ...],
+        wraps: tuple[int, ...],
+    ) -> None:
+        self.channels, self.sizes, self.offsets, self.wraps = channels, sizes, offsets, wraps
+        self._key = channels, sizes, offsets, wraps
+        self._hash = hash(self._key)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, PyramidLayout) and self._key == other._key
+
+    def __hash__(self) -> int:
+        return self._hash
+
+    @property
+    def texel_count(self) -> int:
+        """Texels of all levels of all materials."""
+        (width, height), last = self.sizes[-1][-1], self.offsets[-1][-1]
+        return last + width * height
 
     @property
     def levels(self) -> int:
@@ -70,7 +88,7 @@ def pyramid_layout(
             start += w * h
         offsets.append(tuple(own + [own[-1]] * (levels - len(own))))
     padded = [tuple(c + [c[-1]] * (levels - len(c))) for c in chains]
-    return PyramidLayout(channels, tuple(padded), tuple(offsets), tuple(wraps), start)
+    return PyramidLayout(channels, tuple(padded), tuple(offsets), tuple(wraps))
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import replace
 
 import drjit as dr
 import mitsuba as mi
@@ -22,7 +21,7 @@ from appearance_opt.latent.latent import Decoded
 from appearance_opt.latent.positions import POSITIONS
 from appearance_opt.latent.texels import TEXELS, Texels
 from appearance_opt.render import gradient
-from appearance_opt.render.drawn import Drawn
+from appearance_opt.render.drawn import Shown
 from appearance_opt.render.freezing import Frozen
 from appearance_opt.render.pixels import Batch, Grid
 from appearance_opt.render.quality import Quality
@@ -104,17 +103,16 @@ def stages(resolution: int, maps: int) -> dict[str, float]:
     _, by_image = averaged()
 
     def backward() -> tuple:
-        return run(pulled_back, drawn, rendered, decoded, by_image)
+        return run(pulled_back, rendered, decoded, by_image)
 
     def pulled_back(
-        drawn: Drawn,
         rendered: gradient.RenderedBatch,
         decoded: Decoded,
         by_image: mi.Float,
     ) -> tuple:
         tracked = model.track(decoded)
         surface = model.surface(model.vertices(tracked))
-        moving = replace(drawn, surface=surface, maps=model.maps(tracked))
+        moving = Shown(surface, model.maps(tracked), drawn.edges)
         terms = gradient.surrogate(rendered, moving, by_image)
         direct = gradient.direct(
             rendered, moving, lambda c, pixel: covered_loss(loss, target, c, pixel)

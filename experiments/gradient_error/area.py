@@ -68,7 +68,7 @@ def estimated(model: Latent, batch: Batch, quality: Quality) -> float:
     rendered = gradient.render(drawn, batch, quality, 0)
     by_image = np.zeros((batch.grid.pixels, 4), np.float32)
     by_image[:, 3] = 1
-    gradient.backward(gradient.surrogate(rendered, drawn, mi.Float(by_image.ravel())))
+    gradient.backward(gradient.surrogate(rendered, drawn.shown, mi.Float(by_image.ravel())))
     return float(np.array(dr.grad(positions)).astype(np.float64) @ start)
 
 

@@ -19,7 +19,7 @@ from scipy.ndimage import maximum_filter
 
 from appearance_opt.latent import mesh_ops
 from appearance_opt.render import brdf, lattice, material, rays, shading, surface, upload
-from appearance_opt.render.drawn import Drawn
+from appearance_opt.render.drawn import Shown
 from appearance_opt.render.passing import MISS
 from appearance_opt.render.pixels import Batch, Grid
 from appearance_opt.render.shading import shade
@@ -72,7 +72,7 @@ class Supersampler:
         with dr.suspend_grad():
             surface = self.problem.surface(self.topology, flat, self.colors)
             dr.eval(surface.vertices, surface.colors)
-        self.drawn = Drawn(self.scene, surface, self.problem.maps)
+        self.shown = Shown(surface, self.problem.maps)
 
     def image(self, pixels: NDArray, samples: int, half: int) -> NDArray[np.float64]:
         """Linear RGB over the background of the given pixels (P,), each the mean of ``samples``
@@ -106,7 +106,7 @@ class Supersampler:
         if dr.width(kept):
             hits, k = hits.keep(kept), dr.gather(mi.UInt32, k, kept)
             with dr.suspend_grad():
-                c = shade(self.drawn, self.batch, hits, dr.opaque(mi.Float, 1 / 16))
+                c = shade(self.shown, self.batch, hits, dr.opaque(mi.Float, 1 / 16))
             value = mi.ArrayXf([c.x, c.y, c.z, dr.full(mi.Float, 1, dr.width(kept))])
             dr.scatter_reduce(dr.ReduceOp.Add, image, value, k, mode=dr.ReduceMode.Local)
         return np.array(image).reshape(n, 4).astype(np.float64)
