@@ -40,3 +40,4 @@ class Rates:
     base_color: float = 0.005
     material: float = 0.005
     displacement: float = 0.01
+    weight: float = 0.05
