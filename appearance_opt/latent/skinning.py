@@ -8,7 +8,7 @@ the blended matrices would be the normals of another surface.
 
 What is stored are logarithms l of shares; w = exp(l) / sum(exp(l)) is not negative and of sum one by
 construction, and small weights stay small under noise. Of three such maps it came nearest to known
-weights in the same number of steps (docs/trials.md: skinning weights).
+weights in the same number of steps (docs/trials.md: skinning).
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 WEIGHTS = "weights"
 """Name of the part."""
 
-FLOOR = 1e-3  # docs/trials.md: skinning weights
+FLOOR = 1e-3  # docs/trials.md: skinning
 """Weight that a bone of the support starts from which has none: enough for a gradient, and too
 little to be seen."""
 
