@@ -151,14 +151,14 @@ class ViewSampler:
             intensity,
             spin,
         )
-        return views if self.hull is None else _framed(views, self.hull)
+        return views if self.hull is None else frame(views, self.hull)
 
 
 MARGIN = 1.02
 """A framed view is this many times as wide as the object."""
 
 
-def _framed(views: Views, points: NDArray) -> Views:
+def frame(views: Views, points: NDArray) -> Views:
     """The same eyes and lights, turned and zoomed so that ``points`` (N, 3) just fill each
     image."""
     scale = np.linalg.norm(views.right, axis=1, keepdims=True)

@@ -98,7 +98,7 @@ def test_control_characters_and_surrogates_are_shown_as_escapes() -> None:
     assert str(InputError("x\x07: no")) == "x\\x07: no"
     text = str(InputError("begin " + "x" * 5000 + " end"))
     assert len(text) == 1000 and text.startswith("begin x") and text.endswith("x end")
-    shown = page(ReportData("a\x1b<b>{{facts}}", {"k": "{{notes}}"}, {}, [], notes=["n\x1b"]), {})
+    shown = page(ReportData("a\x1b<b>{{facts}}", {"k": "{{notes}}"}, {}, [], notes=["n\x1b"]))
     assert "\x1b" not in shown
     assert "a\\x1b&lt;b&gt;{{facts}}" in shown and "{{notes}}" in shown
 

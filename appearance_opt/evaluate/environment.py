@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from appearance_opt.asset.types import Asset, Material
+    from appearance_opt.reference.mesh import MeshReference
     from appearance_opt.views import Views
 
 GROUND, HORIZON, ZENITH = (0.16, 0.145, 0.13), (0.50, 0.51, 0.53), (0.34, 0.42, 0.55)
@@ -114,39 +115,54 @@ def render_environment(
     Every light has one ray in each pixel, at a place of its own, so that outlines are smooth.
     Roughness is widened by the size of the light's part of the sky, as if it shone from all of it
     (after Karis, "Real Shading in Unreal Engine 4", 2013, on area lights)."""
-    from appearance_opt.reference.mesh import MeshReference
-    from appearance_opt.render.pixels import Batch, Grid
+    from appearance_opt.reference.mesh import MAX_PIXELS, MeshReference
 
-    count = len(lights.directions)
-    reference = MeshReference(_widened(asset, (2 / count) ** 0.5 / 2))
-    grid = Grid(len(views), resolution)
-    shape = (len(views), resolution, resolution, 4)
-
-    def drawn(lamp: NDArray, intensity: float, shift: NDArray) -> NDArray[np.float64]:
-        moved = views.forward + (views.right * shift[0] + views.down * shift[1]) * 2 / resolution
-        one = replace(
-            views,
-            forward=moved.astype(np.float32),
-            light=np.broadcast_to(lamp.astype(np.float32), views.light.shape),
-            intensity=np.full_like(views.intensity, intensity),
-        )
-        image = reference.render_device(Batch(one.records(), grid), 1, 0.0)
-        return np.array(image).reshape(shape).astype(np.float64)
-
-    out = np.zeros(shape)
+    reference = MeshReference(_widened(asset, (2 / len(lights.directions)) ** 0.5 / 2))
     # what shows its colour whatever the light must not be counted once per light
     some_unlit = any(m.material.unlit for m in asset.meshes)
+    step = max(1, MAX_PIXELS // resolution**2)
+    parts = [views[k : k + step] for k in range(0, len(views), step)]
+    return np.concatenate([_lit(reference, p, resolution, lights, some_unlit) for p in parts])
+
+
+def _lit(
+    reference: MeshReference,
+    views: Views,
+    resolution: int,
+    lights: DistantLights,
+    some_unlit: bool,
+) -> NDArray[np.float32]:
+    import drjit as dr
+    import mitsuba as mi
+
+    from appearance_opt.backend import to_device
+    from appearance_opt.render.pixels import Batch, Grid
+
+    grid, count = Grid(len(views), resolution), len(lights.directions)
+    total = dr.zeros(mi.Float, grid.pixels * 4)
+
+    def add(view: Views, weight: NDArray) -> None:
+        nonlocal total
+        image = reference.render_device(Batch(view.records(), grid), 1, 0.0)
+        total += image * dr.tile(to_device(weight), grid.pixels)
+        dr.eval(total)
+
     for k in range(count):
-        lamp, shift = lights.directions[k] * FAR, _place(k, count)
-        image = drawn(lamp, FAR**2, shift)
-        lit = image[..., :3]
+        shift = _place(k, count) * 2 / resolution
+        forward = views.forward + views.right * shift[0] + views.down * shift[1]
+        lamp = (lights.directions[k] * FAR).astype(np.float32)
+        lit = replace(
+            views,
+            forward=forward.astype(np.float32),
+            light=np.broadcast_to(lamp, views.light.shape),
+            intensity=np.full_like(views.intensity, FAR**2),
+        )
+        weight = lights.irradiance[k]
+        add(lit, np.append(weight, 1 / count))
         if some_unlit:
-            own = drawn(lamp, 0.0, shift)[..., :3]
-            lit = lit - own
-            out[..., :3] += own / count
-        out[..., :3] += lit * lights.irradiance[k]
-        out[..., 3] += image[..., 3] / count
-    return out.astype(np.float32)
+            dark = replace(lit, intensity=np.zeros_like(lit.intensity))
+            add(dark, np.append(1 / count - weight, 0.0))
+    return np.array(total).reshape(len(views), resolution, resolution, 4)
 
 
 def _place(index: int, count: int) -> NDArray[np.float64]:

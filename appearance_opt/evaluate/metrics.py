@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,19 +12,27 @@ from appearance_opt.render.display import display
 
 BEST_PSNR = 99.0
 
+NOTICED = 0.1
+"""FLIP error from which on an eye notices a pixel that changes: that of colours which differ by
+2.3 units in CIELAB, the just noticeable difference of Mahy et al. (1994), by FLIP's own mapping
+of distances to errors (Andersson et al. 2020, section 4.1.3: 0.95 (2.3 / 41.3^(1 / 0.7))^0.7 / 0.4
+is 0.103), for a viewer 0.7 m from a screen with 67 pixels per degree."""
+
 
 @dataclass(frozen=True)
 class ViewMetrics:
     """One view. PSNR in dB of sRGB display values in [0, 1], over the whole image and over the
     pixels that either image covers; mean FLIP (Andersson et al. 2020, LDR); intersection over union
     of the silhouettes; mean distance in pixels by which they differ (difference in coverage over
-    the reference's outline)."""
+    the reference's outline); share of the covered pixels at which a viewer who flips between the
+    two notices a difference (see ``NOTICED``)."""
 
     psnr: float
     psnr_covered: float
     flip: float
     silhouette_iou: float
     silhouette_shift: float
+    noticed: float
 
 
 @dataclass(frozen=True)
@@ -36,6 +44,7 @@ class Metrics:
     flip: float
     silhouette_iou: float
     silhouette_shift: float
+    noticed: float
     views: tuple[ViewMetrics, ...]
 
 
@@ -55,7 +64,7 @@ def compare_images(reference: NDArray, candidate: NDArray) -> Metrics:
         raise InputError(
             f"nothing is seen in any of {len(views)} views: there is nothing to compare"
         )
-    names = ("psnr", "psnr_covered", "flip", "silhouette_iou", "silhouette_shift")
+    names = [f.name for f in fields(ViewMetrics)]
     means = {n: float(np.mean([getattr(v, n) for v in seen])) for n in names}
     return Metrics(**means, views=views)
 
@@ -66,7 +75,8 @@ def _view(reference: NDArray, candidate: NDArray) -> ViewMetrics:
     a, b = display(reference), display(candidate)
     error = np.mean((a - b) ** 2, axis=-1)
     covered = (reference[..., 3] > 0) | (candidate[..., 3] > 0)
-    _, flip, _ = flip_evaluator.evaluate(a, b, "LDR", inputsRGB=True)
+    errors, flip, _ = flip_evaluator.evaluate(a, b, "LDR", inputsRGB=True, applyMagma=False)
+    errors = np.asarray(errors).reshape(covered.shape)
     inside, other = reference[..., 3] > 0.5, candidate[..., 3] > 0.5
     outline = int((inside[1:] != inside[:-1]).sum() + (inside[:, 1:] != inside[:, :-1]).sum())
     return ViewMetrics(
@@ -77,6 +87,7 @@ def _view(reference: NDArray, candidate: NDArray) -> ViewMetrics:
         silhouette_shift=float(
             np.abs(reference[..., 3] - candidate[..., 3]).sum() / max(outline, 1)
         ),
+        noticed=float((errors[covered] > NOTICED).mean()) if covered.any() else 0.0,
     )
 
 
@@ -84,3 +95,10 @@ def _psnr(mean_squared_error: float) -> float:
     if mean_squared_error <= 0:
         return BEST_PSNR
     return float(min(BEST_PSNR, -10 * np.log10(mean_squared_error)))
+
+
+def halve(images: NDArray) -> NDArray[np.float32]:
+    """(B, H, W, 4) images at half the resolution, which must be even: averages of four pixels, as
+    the light of a pixel half as fine."""
+    b, h, w, c = images.shape
+    return images.reshape(b, h // 2, 2, w // 2, 2, c).mean(axis=(2, 4), dtype=np.float32)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import tempfile
+from pathlib import Path
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -32,6 +35,40 @@ def wireframe(image: NDArray, triangle: NDArray) -> NDArray[np.uint8]:
     line = np.clip(share * 1.5, 0, 1)[..., None] * (image[..., 3:] > 0)
     base = 0.35 + 0.65 * display(image)
     return _bytes(base * (1 - line) + line * np.array([0.05, 0.12, 0.3]))
+
+
+def shrink(pixels: NDArray, size: int) -> NDArray:
+    """(H, W, C) pixels, at most ``size`` high and wide: averages over rectangles."""
+    height, width = pixels.shape[:2]
+    factor = max(height, width) / size
+    if factor <= 1:
+        return pixels
+    rows, columns = (max(round(n / factor), 1) for n in (height, width))
+    y, x = np.arange(rows) * height // rows, np.arange(columns) * width // columns
+    sums = np.add.reduceat(np.add.reduceat(pixels.astype(np.float64), y, 0), x, 1)
+    area = np.diff(np.append(y, height))[:, None] * np.diff(np.append(x, width))[None]
+    mean = sums / area[..., None]
+    return (mean if pixels.dtype.kind == "f" else np.round(mean)).astype(pixels.dtype)
+
+
+def encode_web(pixels: NDArray, quality: int | None) -> bytes:
+    """WebP file of (H, W, 3 or 4) uint8 pixels; ``quality``: 1 to 100, or None for lossless."""
+    import OpenImageIO as oiio
+
+    height, width, channels = pixels.shape
+    spec = oiio.ImageSpec(width, height, channels, oiio.UINT8)
+    spec.attribute("compression", "lossless" if quality is None else f"webp:{quality}")
+    # reports share a time budget with the fit: the last tenth of the bytes takes most of the time
+    spec.attribute("webp:method", 0 if quality is None else 2)
+    spec.attribute("oiio:UnassociatedAlpha", 1)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "image.webp"
+        out = oiio.ImageOutput.create(str(path))
+        done = out is not None and out.open(str(path), spec)
+        done = done and out.write_image(np.ascontiguousarray(pixels)) and out.close()
+        if not done:
+            raise OSError(f"a picture could not be encoded in {folder} (is its disk full?)")
+        return path.read_bytes()
 
 
 def texture_pictures(asset: Asset) -> dict[str, NDArray[np.uint8]]:

@@ -1,0 +1,145 @@
+"""What a report shows of a reference and of what was made from it: numbers from random views,
+a picture from an upright one, previews in 3D."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from appearance_opt.evaluate import pictures
+from appearance_opt.evaluate.comparison import render_asset
+from appearance_opt.evaluate.environment import distant_lights, render_environment
+from appearance_opt.evaluate.hero import hero_view
+from appearance_opt.evaluate.metrics import compare_images
+from appearance_opt.evaluate.preview import preview_of
+from appearance_opt.evaluate.verdict import at_sizes
+from appearance_opt.reference.mesh import MeshReference
+from appearance_opt.reference.pool import check_images
+from appearance_opt.render.rays import MISS, trace
+from appearance_opt.views import MEASURED
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from appearance_opt.asset.types import Asset
+    from appearance_opt.evaluate.metrics import Metrics
+    from appearance_opt.evaluate.preview import Preview
+    from appearance_opt.evaluate.verdict import AtSize
+    from appearance_opt.reference.base import Reference
+    from appearance_opt.views import Views, ViewSampler
+
+LIGHTS = 16
+"""Of the environment in which the pictures are taken: as many rays per pixel."""
+
+SMALL = 96
+"""Pixels per side where a view is chosen."""
+
+
+@dataclass(frozen=True)
+class Looks:
+    """How finely a report looks: random views of so many pixels and samples, and the pixels of the
+    upright picture."""
+
+    views: int = 8
+    resolution: int = 384
+    samples: int = 9
+    pictured: int = 576
+
+
+@dataclass
+class Shown:
+    """See ``ReportData``, whose fields these are."""
+
+    metrics: dict[str, Metrics]
+    by_size: list[AtSize]
+    views: list[dict[str, NDArray[np.uint8]]]
+    captions: list[str]
+    previews: dict[str, Preview]
+    azimuth: float
+    elevation: float
+
+
+def show(
+    reference: Reference,
+    original: Asset | None,
+    columns: dict[str, Asset],
+    result: Asset,
+    sampler: ViewSampler,
+    looks: Looks,
+) -> Shown:
+    """Look at a reference and at the ``columns`` of a report, the last of which is what came of it;
+    ``result``: the asset that was written. All of them in local coordinates. ``original``: what the
+    reference was made from, None if that is no asset: it has no preview then, and its pictures are
+    lit by a lamp."""
+    views = sampler.held_out(MEASURED).draw(0, looks.views)
+    size, samples = looks.resolution, looks.samples
+    drawn = check_images(reference.render(views, size, samples), len(views), size, "the report")
+    images = {name: render_asset(a, views, size, samples) for name, a in columns.items()}
+    metrics = {name: compare_images(drawn, image) for name, image in images.items()}
+    last = list(columns)[-1]
+    final = columns[last]
+
+    assert sampler.hull is not None
+    upright = hero_view(sampler.hull, lambda v: reference.render(v, SMALL, 4))
+    if original is None:
+        first = check_images(
+            reference.render(upright, looks.pictured, samples), 1, looks.pictured, "the report"
+        )
+        second = render_asset(final, upright, looks.pictured, samples)
+        light = "a lamp"
+    else:
+        lights = distant_lights(LIGHTS)
+        first, second = (
+            render_environment(a, upright, looks.pictured, lights) for a in (original, final)
+        )
+        light = "a sky and three lamps"
+    wires = triangle_images(final, upright, 2 * looks.pictured)
+    pictured = [
+        {
+            "reference": pictures.picture(r),
+            "result": pictures.picture(c),
+            "wireframe": pictures.wireframe(c, t),
+        }
+        for r, c, t in zip(first, second, wires, strict=True)
+    ]
+    worst = int(np.argmax([v.flip for v in metrics[last].views]))
+    pictured.append(
+        {
+            "reference": pictures.picture(drawn[worst]),
+            "result": pictures.picture(images[last][worst]),
+        }
+    )
+    captions = [
+        f"under {light}",
+        f"of the {len(views)} random views the one that differs most (FLIP), under its lamp",
+    ]
+    previews = {} if original is None else {"original": preview_of(original)}
+    x, y, z = upright.eye[0] / np.linalg.norm(upright.eye[0])
+    return Shown(
+        metrics=metrics,
+        by_size=at_sizes(drawn, images[last], metrics[last]),
+        views=pictured,
+        captions=captions,
+        previews={**previews, "result": preview_of(result)},
+        azimuth=float(np.degrees(np.arctan2(x, z))),
+        elevation=float(np.degrees(np.arcsin(y))),
+    )
+
+
+def triangle_images(asset: Asset, views: Views, resolution: int) -> NDArray[np.int64]:
+    """(B, H, W) index of the triangle seen in each pixel, -1 for none."""
+    import mitsuba as mi
+
+    scene = MeshReference(asset).scene
+    count = resolution * resolution
+    out = []
+    y, x = np.divmod(np.arange(count), resolution)
+    for k in range(len(views)):
+        view = mi.UInt32(np.zeros(count, np.uint32))
+        px, py = mi.Float((x + 0.5).astype(np.float32)), mi.Float((y + 0.5).astype(np.float32))
+        hits = trace(scene, views[k : k + 1].records(), view, px, py, mi.Float(resolution))
+        triangle = np.array(hits.triangle).astype(np.int64)
+        out.append(np.where(triangle == MISS, -1, triangle).reshape(resolution, resolution))
+    return np.stack(out)

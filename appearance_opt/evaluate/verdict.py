@@ -1,0 +1,87 @@
+"""What a report says in a sentence: how much smaller, and from which size on differences are
+seen."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from appearance_opt.evaluate.metrics import compare_images, halve
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from appearance_opt.evaluate.metrics import Metrics
+
+SMALLEST = 48
+"""Pixels: what is smaller is an icon."""
+
+INVISIBLE, HARDLY = 0.01, 0.05
+"""Shares of the pixels that a viewer notices, up to which differences are called invisible, and
+hardly visible."""
+
+
+@dataclass(frozen=True)
+class AtSize:
+    """Means over the same views at a resolution of so many ``pixels`` per side: share of the
+    covered pixels where a difference is noticed, PSNR over covered pixels, FLIP."""
+
+    pixels: int
+    noticed: float
+    psnr_covered: float
+    flip: float
+
+
+def at_sizes(reference: NDArray, candidate: NDArray, known: Metrics | None = None) -> list[AtSize]:
+    """How different (B, H, W, 4) images are, the largest first, and at halves of their size, as
+    long as they can be halved. ``known``: their metrics, where they are measured already."""
+    out: list[AtSize] = []
+    while True:
+        m = compare_images(reference, candidate) if known is None or out else known
+        out.append(AtSize(reference.shape[1], m.noticed, m.psnr_covered, m.flip))
+        if reference.shape[1] % 2 or reference.shape[1] < 2 * SMALLEST:
+            return out
+        reference, candidate = halve(reference), halve(candidate)
+
+
+def describe_visibility(sizes: list[AtSize]) -> str:
+    """One sentence on the sizes, which come the largest first. It says no more than was measured.
+
+    >>> describe_visibility([AtSize(96, 0.2, 30, 0.1), AtSize(48, 0.004, 40, 0.01)])
+    'Differences are invisible at 48 pixels and visible in 20 % of the pixels at 96.'
+    """
+    largest = sizes[0]
+    unseen = _largest(sizes, INVISIBLE)
+    faint = _largest(sizes, HARDLY)
+    if unseen is largest:
+        return f"Differences are invisible at {largest.pixels} pixels, the largest size measured."
+    seen = f"visible in {percent(largest.noticed)} of the pixels at {largest.pixels}"
+    if unseen is not None:
+        return f"Differences are invisible at {unseen.pixels} pixels and {seen}."
+    if faint is not None:
+        return f"Differences are hardly visible at {faint.pixels} pixels and {seen}."
+    small = sizes[-1]
+    if small is largest:
+        return f"Differences are {seen} pixels."
+    return (
+        f"Differences are visible at every size: in {percent(small.noticed)} of the pixels at "
+        f"{small.pixels} pixels, in {percent(largest.noticed)} at {largest.pixels}."
+    )
+
+
+def _largest(sizes: list[AtSize], share: float) -> AtSize | None:
+    """The largest size up to which, from the smallest on, no more than ``share`` is noticed."""
+    found = None
+    for size in reversed(sizes):
+        if size.noticed > share:
+            break
+        found = size
+    return found
+
+
+def percent(share: float) -> str:
+    """A share in words: two digits, and none that is not there."""
+    value = 100 * share
+    if value == 0 or value >= 9.95:
+        return f"{value:.0f} %"
+    return f"{value:.1f} %" if value >= 0.095 else f"{value:.1g} %"
