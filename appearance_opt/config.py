@@ -30,6 +30,8 @@ from appearance_opt.options.start import StartOptions
 from appearance_opt.options.views import ViewOptions
 
 DEVICES = ("auto", "cpu", "cuda")
+COMPARED_LIGHTS = ("point", "environment")
+RENDERERS = ("own", "path")
 
 PRESETS: dict[str, dict[str, Any]] = {
     "draft": {"budget": 19.0, "resolution": 192, "pool": 64, "reallocate": 0},
@@ -111,7 +113,26 @@ class CompareOptions(Options):
     asset: AssetOptions = part(AssetOptions)
     views: int = option(12, "Number of views.", panel="Views", low=1)
     resolution: int = option(384, "Pixels per side.", panel="Views", low=16, high=8192)
-    samples: int = option(16, "Rays per pixel.", panel="Views", low=1, high=4096)
+    samples: int | None = option(
+        None,
+        "Rays per pixel; under an environment, lights, one ray for each.",
+        panel="Views",
+        low=1,
+        high=4096,
+        automatic="16; 64 under an environment or by paths",
+    )
+    light: str = option(
+        "point",
+        "point (a lamp of its own in each view) or environment (a sky and three lamps).",
+        panel="Views",
+        choices=COMPARED_LIGHTS,
+    )
+    renderer: str = option(
+        "own",
+        "own (fast, no shadows) or path (Mitsuba's path tracer, its own materials, shadows).",
+        panel="Views",
+        choices=RENDERERS,
+    )
     seed: int = option(0, "Seed of views and lights.", panel="Views", low=0)
     device: str = _device()
 

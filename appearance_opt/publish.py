@@ -52,6 +52,11 @@ class Publication:
             self._staged[folder] = _Staged.made(folder)
         return self._staged[folder].new / final.name
 
+    def files(self, main: Path) -> tuple[Path, ...]:
+        """The final names of what is written so far, ``main`` first."""
+        found = [final for staged in self._staged.values() for _, final in staged.moves()]
+        return tuple(sorted(found, key=lambda path: path.name != Path(main).name))
+
     def commit(self) -> None:
         """Give all files their final names, or none. Raises OSError, InputError."""
         roots = {p.parent.resolve() / p.name for p in self._roots}

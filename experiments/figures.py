@@ -21,10 +21,8 @@ def main() -> None:
         sys.exit(f"{REPORT} is not there: run 'make demo' first")
     TARGET.mkdir(parents=True, exist_ok=True)
     names = ("reference", "result", "wireframe")
-    rows = [
-        np.concatenate([read(REPORT / f"view{k}_{n}.png") for n in names], axis=1) for k in (0, 1)
-    ]
-    (TARGET / "demo.png").write_bytes(encode_png(np.ascontiguousarray(np.concatenate(rows))))
+    row = np.concatenate([read(REPORT / f"view0_{n}.png") for n in names], axis=1)
+    (TARGET / "demo.png").write_bytes(encode_png(np.ascontiguousarray(row)))
     maps = ("base_colour", "roughness__metalness", "normal")
     small = [read(REPORT / f"map_{n}.png")[::3, ::3] for n in maps]
     (TARGET / "demo_maps.png").write_bytes(

@@ -9,20 +9,23 @@ from __future__ import annotations
 import os
 from importlib import import_module
 from pathlib import Path
+from typing import Any
 
-SMALL = {
+from appearance_opt.evaluate.showing import Looks
+
+SMALL: dict[str, dict[str, Any]] = {
     "appearance_opt.initial.density": {"BATCHES": 1, "RESOLUTION": 64},
     "appearance_opt.initial.reallocate": {"RESOLUTION": 64},
-    "appearance_opt.jobs.report": {"VIEWS": 2, "RESOLUTION": 64, "PICTURED": 2},
+    "appearance_opt.jobs.report": {"LOOKS": Looks(views=2, resolution=64, pictured=64)},
     "appearance_opt.initial.decimation": {"VISIBILITY_VIEWS": 64},
     "appearance_opt.stages.growth": {"RESOLUTION": 64, "POOL": 64},
 }
 """Values of module constants."""
 
 
-def make_small() -> dict[str, dict[str, int]]:
+def make_small() -> dict[str, dict[str, Any]]:
     """Set ``SMALL``, in this process; returns what was there."""
-    before: dict[str, dict[str, int]] = {}
+    before: dict[str, dict[str, Any]] = {}
     for name, values in SMALL.items():
         module = import_module(name)
         before[name] = {constant: getattr(module, constant) for constant in values}
@@ -31,7 +34,7 @@ def make_small() -> dict[str, dict[str, int]]:
     return before
 
 
-def restore(before: dict[str, dict[str, int]]) -> None:
+def restore(before: dict[str, dict[str, Any]]) -> None:
     """Undo ``make_small``."""
     for name, values in before.items():
         for constant, value in values.items():

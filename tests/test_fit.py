@@ -277,7 +277,7 @@ def test_simplify_end_to_end(ball: Asset, tmp_path: Path) -> None:
     assert mesh.tangents is not None
     assert mesh.material.base_color_texture.pixels.shape == (64, 64, 3)
     page = (tmp_path / "report" / "report.html").read_text()
-    assert 'src="data:image/png' in page
+    assert 'src="data:image/webp' in page
     # self-contained: no address outside of the pictures, whose letters may spell anything
     assert "http" not in re.sub(r"base64,[A-Za-z0-9+/=]*", "", page).replace("http-equiv", "")
     assert {"report.json", "view0_wireframe.png"} <= {

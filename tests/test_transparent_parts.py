@@ -14,7 +14,6 @@ from appearance_opt.asset import load, save
 from appearance_opt.asset.alpha import kind_of, seen_through
 from appearance_opt.asset.types import Asset, Material, Mesh, Texture
 from appearance_opt.errors import InputError
-from appearance_opt.jobs import report
 from appearance_opt.jobs.simplify import fingerprint
 from appearance_opt.placement import Placement
 from appearance_opt.reference.subject import Subject
@@ -67,10 +66,7 @@ def check_kept(result: Asset, source: Asset) -> None:
                 assert before == after
 
 
-def test_simplified_beside_what_stays(
-    tmp_path: Path, snow_globe: Asset, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(report, "RESOLUTION", 64)
+def test_simplified_beside_what_stays(tmp_path: Path, snow_globe: Asset) -> None:
     save(snow_globe, tmp_path / "globe.glb")
     source = load(tmp_path / "globe.glb")
     result = appearance_opt.simplify(

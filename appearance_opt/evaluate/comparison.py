@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from appearance_opt.asset.types import Asset
+    from appearance_opt.config import CompareOptions
     from appearance_opt.evaluate.metrics import Metrics
     from appearance_opt.views import Views, ViewSampler
 
@@ -32,27 +33,50 @@ class Comparison:
 
 
 def compare_local(
-    reference: Asset,
-    candidate: Asset,
-    sampler: ViewSampler,
-    views: int,
-    resolution: int,
-    samples: int,
+    reference: Asset, candidate: Asset, sampler: ViewSampler, options: CompareOptions
 ) -> Comparison:
     """Measure how different two assets look, which lie around the origin as the sampler asks.
-    Raises InputError if one of the two shows nothing."""
-    drawn = sampler.draw(0, views)
-    first, second = (render_asset(a, drawn, resolution, samples) for a in (reference, candidate))
+    Raises InputError if one of the two shows nothing, BackendError if the path tracer does not
+    run here."""
+    drawn = sampler.draw(0, options.views)
+    (first, told), (second, more) = (_draw(a, drawn, options) for a in (reference, candidate))
     for name, image, side in (
         (reference.name, first, "reference"),
         (candidate.name, second, "candidate"),
     ):
         if not image[..., 3].any():
             raise InputError(
-                f"{name}: nothing of it is seen in any of the {views} views, so that there is nothing to compare; "
-                f"is the {side} far smaller than the other, inside out, or altogether transparent?"
+                f"{name}: nothing of it is seen in any of the {options.views} views, so that "
+                f"there is nothing to compare; is the {side} far smaller than the other, inside "
+                "out, or altogether transparent?"
             )
-    return Comparison(compare_images(first, second), first, second)
+    notes = tuple(dict.fromkeys((*told, *more)))
+    return Comparison(compare_images(first, second), first, second, notes)
+
+
+MANY_SAMPLES, SAMPLES = 64, 16
+"""Rays per pixel where nothing is asked for: under an environment or by paths, and else."""
+
+
+def _draw(
+    asset: Asset, views: Views, options: CompareOptions
+) -> tuple[NDArray[np.float32], tuple[str, ...]]:
+    """(images, notes)"""
+    from appearance_opt.evaluate.environment import distant_lights, render_environment
+
+    environment, traced = options.light == "environment", options.renderer == "path"
+    samples = options.samples or (MANY_SAMPLES if environment or traced else SAMPLES)
+    notes: tuple[str, ...] = ()
+    if traced:
+        from appearance_opt.evaluate.path_traced import PathTraced
+
+        tracer = PathTraced(asset, environment)
+        notes, images = tracer.notes, tracer.render(views, options.resolution, samples)
+    elif environment:
+        images = render_environment(asset, views, options.resolution, distant_lights(samples))
+    else:
+        return render_asset(asset, views, options.resolution, samples), ()
+    return check_images(images, len(views), options.resolution, asset.name), notes
 
 
 def render_asset(asset: Asset, views: Views, resolution: int, samples: int) -> NDArray[np.float32]:

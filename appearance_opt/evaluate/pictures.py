@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import tempfile
-from pathlib import Path
-
 import numpy as np
 from numpy.typing import NDArray
 
+from appearance_opt.asset.images import encode_webp
 from appearance_opt.asset.types import Asset, linear_to_srgb
 from appearance_opt.render.display import display
 
@@ -51,24 +49,10 @@ def shrink(pixels: NDArray, size: int) -> NDArray:
     return (mean if pixels.dtype.kind == "f" else np.round(mean)).astype(pixels.dtype)
 
 
-def encode_web(pixels: NDArray, quality: int | None) -> bytes:
-    """WebP file of (H, W, 3 or 4) uint8 pixels; ``quality``: 1 to 100, or None for lossless."""
-    import OpenImageIO as oiio
-
-    height, width, channels = pixels.shape
-    spec = oiio.ImageSpec(width, height, channels, oiio.UINT8)
-    spec.attribute("compression", "lossless" if quality is None else f"webp:{quality}")
-    # reports share a time budget with the fit: the last tenth of the bytes takes most of the time
-    spec.attribute("webp:method", 0 if quality is None else 2)
-    spec.attribute("oiio:UnassociatedAlpha", 1)
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "image.webp"
-        out = oiio.ImageOutput.create(str(path))
-        done = out is not None and out.open(str(path), spec)
-        done = done and out.write_image(np.ascontiguousarray(pixels)) and out.close()
-        if not done:
-            raise OSError(f"a picture could not be encoded in {folder} (is its disk full?)")
-        return path.read_bytes()
+def encode_for_page(pixels: NDArray, quality: int | None) -> bytes:
+    """WebP file of (H, W, 3 or 4) uint8 pixels; ``quality``: 1 to 100, or None for lossless. Made
+    fast: reports share a time budget with the fit."""
+    return encode_webp(pixels, quality, 0 if quality is None else 2)
 
 
 def texture_pictures(asset: Asset) -> dict[str, NDArray[np.uint8]]:

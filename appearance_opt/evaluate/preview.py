@@ -18,7 +18,7 @@ from scipy.sparse.csgraph import connected_components
 from appearance_opt.asset.alpha import coverage, kind_of
 from appearance_opt.asset.batch import fill_normals
 from appearance_opt.asset.images import to_color
-from appearance_opt.evaluate.pictures import encode_web, shrink
+from appearance_opt.evaluate.pictures import encode_for_page, shrink
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -144,7 +144,7 @@ class _Writer:
         key = id(t.pixels), kind, alpha
         if key not in self._known:
             self._known[key] = len(self.images)
-            self.images.append(encode_web(_eight_bits(t, self._size, alpha), QUALITY[kind]))
+            self.images.append(encode_for_page(_eight_bits(t, self._size, alpha), QUALITY[kind]))
         return {"image": self._known[key], "srgb": t.color_space == "srgb", "wrap": list(t.wrap)}
 
 

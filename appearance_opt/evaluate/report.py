@@ -22,7 +22,7 @@ from appearance_opt.errors import one_line
 from appearance_opt.evaluate import three
 from appearance_opt.evaluate.environment import panorama
 from appearance_opt.evaluate.metrics import Metrics
-from appearance_opt.evaluate.pictures import encode_web, shrink
+from appearance_opt.evaluate.pictures import encode_for_page, shrink
 from appearance_opt.evaluate.preview import MAX_BYTES, Preview
 from appearance_opt.evaluate.sizes import Sizes, in_bytes
 from appearance_opt.evaluate.verdict import AtSize, describe_visibility, percent
@@ -35,6 +35,17 @@ MAP_PIXELS, THUMB_PIXELS = 512, 84
 """Of a page's maps and of the small pictures that choose a view; the folder has maps as they are."""
 
 
+@dataclass(frozen=True)
+class Option:
+    """What was asked for: ``flag`` and ``value``, what it means in a sentence, and is it the
+    default?"""
+
+    flag: str
+    value: Any
+    meaning: str
+    default: bool
+
+
 @dataclass
 class ReportData:
     """Everything a report shows.
@@ -44,8 +55,8 @@ class ReportData:
     of one view of one size; ``captions``: of the views; ``maps``: pictures of the maps; ``curve``:
     rows (seconds, step, PSNR, loss); ``facts``: what was asked and done; ``by_size``: how different
     the two look at which size; ``sizes``: of "original" and "result"; ``previews``: the same in 3D;
-    ``links``: label and file, relative to the folder; ``azimuth``, ``elevation`` (degrees): from
-    where the viewer looks first.
+    ``links``: label and file, relative to the folder; ``options``: what was asked for; ``azimuth``,
+    ``elevation`` (degrees): from where the viewer looks first.
     """
 
     title: str
@@ -61,6 +72,7 @@ class ReportData:
     sizes: dict[str, Sizes] = field(default_factory=dict)
     previews: dict[str, Preview] = field(default_factory=dict)
     links: dict[str, str] = field(default_factory=dict)
+    options: list[Option] = field(default_factory=list)
     azimuth: float = 35.0
     elevation: float = 18.0
 
@@ -91,6 +103,7 @@ def as_json(data: ReportData) -> dict[str, Any]:
     return {
         "title": data.title,
         "facts": data.facts,
+        "options": {o.flag.lstrip("-"): o.value for o in data.options},
         "metrics": {name: asdict(m) for name, m in data.metrics.items()},
         # JSON has no NaN: there is no loss before the first step
         "curve": [
@@ -111,7 +124,6 @@ def page(data: ReportData) -> str:
     sections = {
         "title": _html(data.title),
         "style": _part("style.css"),
-        "script": _part("stage.js") + _part("viewer.js"),
         "verdict": _html(verdict(data)),
         "cards": _cards(data.sizes),
         "stage": _stage(data),
@@ -125,11 +137,13 @@ def page(data: ReportData) -> str:
         )
         if len(data.curve) > 1
         else "",
-        "facts": _facts(data.facts),
+        "facts": _facts(data.facts, data.options),
         "notes": _notes(data.notes),
         "files": _links(data.links),
     }
     sections["viewer"], sections["data"] = _viewer(data)
+    scripts = ("stage.js", "viewer.js") if sections["viewer"] else ("stage.js",)
+    sections["script"] = "".join(map(_part, scripts))
     # in one pass: a name that looks like a place of the template stays a name
     return re.sub(r"\{\{(\w+)\}\}", lambda place: sections[place[1]], _part("page.html"))
 
@@ -165,7 +179,7 @@ def _section(title: str, lead: str, content: str) -> str:
 
 def _image(pixels: NDArray, quality: int | None) -> str:
     """Address of a picture that lies in the page. ``quality``: None for lossless."""
-    return "data:image/webp;base64," + base64.b64encode(encode_web(pixels, quality)).decode()
+    return "data:image/webp;base64," + base64.b64encode(encode_for_page(pixels, quality)).decode()
 
 
 def curve_svg(
@@ -458,14 +472,26 @@ def _notes(notes: list[str]) -> str:
     )
 
 
-def _facts(facts: dict[str, Any]) -> str:
+def _facts(facts: dict[str, Any], options: list[Option]) -> str:
     rows = "".join(f"<tr><td>{_html(k)}</td><td>{_html(v)}</td></tr>" for k, v in facts.items())
-    if not rows:
-        return ""
-    return (
-        "<details><summary>What was asked for, and what was done</summary>"
-        f"<div class='scroll'><table class='facts'>{rows}</table></div></details>"
+    done = asked = ""
+    if rows:
+        done = (
+            "<details><summary>What was done</summary>"
+            f"<div class='scroll'><table class='facts'>{rows}</table></div></details>"
+        )
+    chosen = sorted(options, key=lambda o: o.default)
+    rows = "".join(
+        f"<tr><td><code>{_html(o.flag)}</code></td><td>{_html(o.value)}"
+        f"{'' if o.default else ' <b>(chosen)</b>'}</td><td>{_html(o.meaning)}</td></tr>"
+        for o in chosen
     )
+    if rows:
+        asked = (
+            "<details><summary>What was asked for</summary>"
+            f"<div class='scroll'><table class='facts'>{rows}</table></div></details>"
+        )
+    return done + asked
 
 
 def _links(links: dict[str, str]) -> str:

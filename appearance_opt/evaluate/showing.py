@@ -17,7 +17,9 @@ from appearance_opt.evaluate.preview import preview_of
 from appearance_opt.evaluate.verdict import at_sizes
 from appearance_opt.reference.mesh import MeshReference
 from appearance_opt.reference.pool import check_images
-from appearance_opt.render.rays import MISS, trace
+from appearance_opt.render.passing import MISS
+from appearance_opt.render.pixels import Batch, Grid
+from appearance_opt.render.rays import trace_grid
 from appearance_opt.views import MEASURED
 
 if TYPE_CHECKING:
@@ -130,16 +132,11 @@ def show(
 
 def triangle_images(asset: Asset, views: Views, resolution: int) -> NDArray[np.int64]:
     """(B, H, W) index of the triangle seen in each pixel, -1 for none."""
-    import mitsuba as mi
-
-    scene = MeshReference(asset).scene
-    count = resolution * resolution
-    out = []
-    y, x = np.divmod(np.arange(count), resolution)
+    scene, grid = MeshReference(asset).scene, Grid(1, resolution)
+    pixel = np.array(grid.index)
+    out = np.empty((len(views), resolution * resolution), np.int64)
     for k in range(len(views)):
-        view = mi.UInt32(np.zeros(count, np.uint32))
-        px, py = mi.Float((x + 0.5).astype(np.float32)), mi.Float((y + 0.5).astype(np.float32))
-        hits = trace(scene, views[k : k + 1].records(), view, px, py, mi.Float(resolution))
+        hits, _ = trace_grid(scene, Batch(views[k : k + 1].records(), grid))
         triangle = np.array(hits.triangle).astype(np.int64)
-        out.append(np.where(triangle == MISS, -1, triangle).reshape(resolution, resolution))
-    return np.stack(out)
+        out[k, pixel] = np.where(triangle == MISS, -1, triangle)
+    return out.reshape(len(views), resolution, resolution)

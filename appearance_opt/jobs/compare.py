@@ -68,7 +68,7 @@ def _compare(
     apart = _apart(first, second)
     in_one = placement.local(first), placement.local(second)
     try:
-        result = compare_local(*in_one, sampler, options.views, options.resolution, options.samples)
+        result = compare_local(*in_one, sampler, options)
     except (
         InputError
     ) as error:  # of two small things far from each other, pictures may show neither
@@ -76,9 +76,16 @@ def _compare(
     if outputs.report is not None:
         from appearance_opt.jobs.report import write_compare_report
 
-        write_compare_report(outputs.report, first, second, result)
+        write_compare_report(outputs.report, first, second, placement, result, options)
     return replace(
-        result, notes=(*first.notes, *second.notes, *apart, *_drawn_otherwise(first, second))
+        result,
+        notes=(
+            *first.notes,
+            *second.notes,
+            *apart,
+            *_drawn_otherwise(first, second),
+            *result.notes,
+        ),
     )
 
 

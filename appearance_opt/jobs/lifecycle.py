@@ -118,6 +118,7 @@ def close_run(
         run.begin("writing the result")
         with publication() as together:
             write(result.asset, together.place(outputs.out), options.output.for_file(outputs.out))
+            result.files = together.files(outputs.out)
             if beside is not None:
                 beside(outputs.out, together)
         run.lap("write")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -10,104 +12,142 @@ import numpy as np
 from appearance_opt import backend
 from appearance_opt.config import as_dict
 from appearance_opt.evaluate import pictures
-from appearance_opt.evaluate.comparison import Comparison, render_asset
-from appearance_opt.evaluate.metrics import compare_images
-from appearance_opt.evaluate.report import ReportData, write_report
-from appearance_opt.reference.mesh import MeshReference
-from appearance_opt.reference.pool import check_images
-from appearance_opt.render.passing import MISS
-from appearance_opt.render.pixels import Batch, Grid
-from appearance_opt.render.rays import trace_grid
-from appearance_opt.views import MEASURED, Views
+from appearance_opt.evaluate.preview import preview_of
+from appearance_opt.evaluate.report import Option, ReportData, write_report
+from appearance_opt.evaluate.showing import Looks, show
+from appearance_opt.evaluate.sizes import sizes_of
+from appearance_opt.evaluate.verdict import at_sizes
+from appearance_opt.options.option import entries, flag_name
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
+    from collections.abc import Iterable
 
     from appearance_opt.asset.types import Asset
-    from appearance_opt.config import CommonOptions
+    from appearance_opt.config import CommonOptions, CompareOptions
+    from appearance_opt.evaluate.comparison import Comparison
     from appearance_opt.jobs.result import Result
+    from appearance_opt.options.option import Record
+    from appearance_opt.placement import Placement
     from appearance_opt.reference.subject import Subject
 
-VIEWS, RESOLUTION, SAMPLES = 8, 384, 9
-PICTURED = 4
+LOOKS = Looks()
+
+MOST_VIEWS, MOST_LINKS = 4, 8
+"""Views of a comparison that a page shows, those that differ most first; files that it links to."""
+
+COLUMNS = {
+    "start": "before any fitting: decimated, with maps that rays have baked",
+    "closed form": "before any fitting: maps as rays have baked them",
+    "fitted": "after the fit, as it is written",
+    "result": "after the fit, as it is written",
+    "level": "the displaced mesh at this level of tessellation",
+}
+"""What the columns of numbers are, by the first word of their names or by all."""
 
 
 def write_job_report(
     folder: Path, result: Result, subject: Subject, options: CommonOptions
 ) -> None:
     """Report of a job: what it started from and what came of it, against images of ``subject``."""
-    views = subject.sampler.held_out(MEASURED).draw(0, VIEWS)
-    drawn = subject.reference.render(views, RESOLUTION, SAMPLES)
-    reference = check_images(drawn, VIEWS, RESOLUTION, "views of the report")
-    local = {name: subject.placement.local(a) for name, a in result.columns.items()}
-    images = {n: render_asset(a, views, RESOLUTION, SAMPLES) for n, a in local.items()}
-    first, *_, last = [*images, *images]  # one and the same where nothing was fitted
-    wires = triangle_images(local[last], views[:PICTURED], 2 * RESOLUTION)
-    per_view = []
-    for r, s, a, t in zip(reference, images[first], images[last], wires, strict=False):
-        shown = {
-            "reference": pictures.picture(r),
-            "result": pictures.picture(a),
-            "difference x 4": pictures.difference(r, a),
-            "wireframe": pictures.wireframe(a, t),
-        }
-        if first != last:
-            shown[first] = pictures.picture(s)
-            shown[f"{first}'s difference x 4"] = pictures.difference(r, s)
-        per_view.append(shown)
+    original = subject.asset
+    shown = show(
+        subject.reference,
+        None if original is None else subject.placement.local(original),
+        {name: subject.placement.local(a) for name, a in result.columns.items()},
+        subject.placement.local(result.asset),
+        subject.sampler,
+        LOOKS,
+    )
     curve = [] if result.fit is None else result.fit.curve
+    sizes = {"result": sizes_of(result.asset, result.files)}
+    if original is not None:
+        sizes = {"original": sizes_of(original, original.files), **sizes}
+    told = {n: COLUMNS.get(n) or COLUMNS.get(n.split()[0]) for n in result.columns}
     data = ReportData(
         title=result.title,
-        facts=_facts(result, options),
-        metrics={name: compare_images(reference, image) for name, image in images.items()},
-        views=per_view,
+        facts=_facts(result),
+        options=_options(options),
         maps={**pictures.texture_pictures(result.asset), **result.pictures},
         curve=[(p.seconds, p.step, p.psnr, p.loss) for p in curve],
         notes=result.notes,
+        columns={name: text for name, text in told.items() if text},
+        sizes=sizes,
+        links=_links(folder, result.files),
+        **{f.name: getattr(shown, f.name) for f in fields(shown)},
     )
     write_report(folder, data)
 
 
 def write_compare_report(
-    folder: Path, reference: Asset, candidate: Asset, result: Comparison
+    folder: Path,
+    reference: Asset,
+    candidate: Asset,
+    placement: Placement,
+    result: Comparison,
+    options: CompareOptions,
 ) -> None:
     """Report of a comparison."""
-    per_view = []
-    for r, c in zip(result.reference, result.candidate, strict=True):
-        shown = {"reference": pictures.picture(r), "result": pictures.picture(c)}
-        per_view.append({**shown, "difference x 4": pictures.difference(r, c)})
+    original, other = placement.local(reference), placement.local(candidate)
+    files = {"original": reference.files, "result": candidate.files}
+    most = [int(k) for k in np.argsort([-v.flip for v in result.metrics.views])][:MOST_VIEWS]
     data = ReportData(
         title=f"{candidate.name} against {reference.name}",
-        facts={
-            "reference triangles": reference.triangle_count,
-            "candidate triangles": candidate.triangle_count,
-        },
+        facts=_versions(),
+        options=_options(options),
         metrics={"candidate": result.metrics},
-        views=per_view,
+        by_size=at_sizes(result.reference, result.candidate, result.metrics),
+        views=[
+            {
+                "reference": pictures.picture(result.reference[k]),
+                "result": pictures.picture(result.candidate[k]),
+            }
+            for k in most
+        ],
+        captions=[f"view {k + 1} of {len(result.reference)}" for k in most],
+        maps=pictures.texture_pictures(candidate),
         notes=[*reference.notes, *candidate.notes],
+        columns={"candidate": f"{candidate.name}, called the result on this page"},
+        sizes={
+            "original": sizes_of(reference, files["original"]),
+            "result": sizes_of(candidate, files["result"]),
+        },
+        links=_links(folder, (*reference.files[:1], *candidate.files[:1])),
+        previews={"original": preview_of(original), "result": preview_of(other)},
     )
     write_report(folder, data)
 
 
-def triangle_images(asset: Asset, views: Views, resolution: int) -> NDArray[np.int64]:
-    """(B, H, W) index of the triangle seen in each pixel, -1 for none."""
-    scene, grid = MeshReference(asset).scene, Grid(1, resolution)
-    pixel = np.array(grid.index)
-    out = np.empty((len(views), resolution * resolution), np.int64)
-    for k in range(len(views)):
-        hits, _ = trace_grid(scene, Batch(views[k : k + 1].records(), grid))
-        triangle = np.array(hits.triangle).astype(np.int64)
-        out[k, pixel] = np.where(triangle == MISS, -1, triangle)
-    return out.reshape(len(views), resolution, resolution)
-
-
-def _facts(result: Result, options: CommonOptions) -> dict[str, object]:
+def _facts(result: Result) -> dict[str, object]:
     facts, fit = dict(result.facts), result.fit
     if fit is not None:
         speed = fit.steps / max(fit.seconds, 1e-9)
         facts["steps"] = f"{fit.steps} ({speed:.1f} per second), best at {fit.best_step}"
         facts |= {"skipped steps": fit.skipped, "triangles turned back": fit.unfolded}
     facts["seconds by stage"] = ", ".join(f"{k} {v:.1f}" for k, v in result.seconds.items())
-    given = {k: v for k, v in as_dict(options).items() if v is not None}
-    facts |= {f"option {k.replace('_', ' ')}": v for k, v in given.items()}
-    return {**facts, **{f"version of {k}": v for k, v in backend.versions().items()}}
+    return {**facts, **_versions()}
+
+
+def _versions() -> dict[str, object]:
+    return {f"version of {k}": v for k, v in backend.versions().items()}
+
+
+def _options(options: Record) -> list[Option]:
+    """What was asked for, in the words of the command line's help."""
+    known = entries(type(options))
+    return [
+        Option(
+            f"--{flag_name(key)}",
+            ",".join(map(str, value)) if isinstance(value, tuple) else value,
+            known[key].spec.help,
+            value == known[key].default,
+        )
+        for key, value in as_dict(options).items()
+        if value is not None
+    ]
+
+
+def _links(folder: Path, files: Iterable[Path]) -> dict[str, str]:
+    """Files by name, relative to the report's folder."""
+    out = {path.name: os.path.relpath(path, folder) for path in files}
+    listed = dict(list(out.items())[:MOST_LINKS])
+    return {**listed, "report.json (all numbers)": "report.json"}

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
+    from pathlib import Path
 
     import numpy as np
     from numpy.typing import NDArray
@@ -26,7 +27,8 @@ class Result:
     source, the start first and what came of it last. ``fit``: curve and counts, None without one.
     ``title`` of a report, ``facts`` that it lists by name, ``pictures`` (H, W, 3) that it shows
     beside those of the maps. ``notes``: what the user should know, a line each. ``seconds``:
-    wall-clock time by stage. ``error``: set when the fit diverged (jobs raise it after the best
+    wall-clock time by stage. ``files``: those that hold the asset, if it was written, the main one
+    first. ``error``: set when the fit diverged (jobs raise it after the best
     state is written).
     """
 
@@ -38,6 +40,7 @@ class Result:
     pictures: dict[str, NDArray[np.uint8]] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
     seconds: dict[str, float] = field(default_factory=dict)
+    files: tuple[Path, ...] = ()
     error: DivergedError | None = None
 
     @property
