@@ -228,8 +228,8 @@ def test_jobs_that_change_an_input_would_be_noticed(
     write = job.write
     for name in ("a.glb", "beside.txt"):
 
-        def faulty(asset: Asset, path: Path, name: str = name) -> None:
-            write(asset, path)
+        def faulty(asset: Asset, path: Path, files: object, name: str = name) -> None:
+            write(asset, path, files)
             (tmp_path / name).write_bytes((tmp_path / name).read_bytes() + b"x")
 
         monkeypatch.setattr(job, "write", faulty)
