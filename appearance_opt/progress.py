@@ -53,7 +53,7 @@ class TerminalProgress:
             self._bar.stop()
 
     def stage(self, text: str) -> None:
-        """See ``fit.loop.Progress``."""
+        """See ``optimize.loop.Progress``."""
         if self._bar is not None:
             self._bar.update(self._task, description=text, info="")
             return
@@ -75,7 +75,7 @@ class TerminalProgress:
         steps_per_second: float,
         seconds_left: float | None,
     ) -> None:
-        """See ``fit.loop.Progress``."""
+        """See ``optimize.loop.Progress``."""
         left = "" if seconds_left is None else f"  {seconds_left:.0f} s left"
         info = f"step {step}  loss {loss:.5f}  held-out {psnr:.2f} dB  {steps_per_second:.1f} steps/s{left}"
         if self._bar is not None:

@@ -42,8 +42,8 @@ def main() -> None:
 
 def arrays() -> dict[str, NDArray[np.float32]]:
     """Reference images, loss and gradients, by what they are called in the table."""
-    from appearance_opt.fit.losses import LOSSES
-    from appearance_opt.fit.step import Gradients, StepInputs
+    from appearance_opt.optimize.losses import LOSSES
+    from appearance_opt.optimize.step import Gradients, StepInputs
     from appearance_opt.reference.pool import Targets
     from appearance_opt.render.pixels import Grid
     from appearance_opt.render.quality import Quality

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import drjit as dr
 
-from appearance_opt.fit.loop import _Run
+from appearance_opt.optimize.loop import _Run
 
 BLOCK, MOST = 8, 15
 FIRST, LATER, CHANCE = 16, 47, 6

@@ -18,9 +18,6 @@ from appearance_opt.asset.validate import validate
 from appearance_opt.baking.target_mesh import movable, prepare
 from appearance_opt.config import bake_options, joint_options, simplify_options
 from appearance_opt.errors import InputError
-from appearance_opt.fit import loop
-from appearance_opt.fit.loop import FitOptions, pose_of
-from appearance_opt.fit.validation import Validation
 from appearance_opt.initial.sphere import sphere
 from appearance_opt.jobs.joint import joint
 from appearance_opt.jobs.result import SimplifyResult
@@ -31,6 +28,9 @@ from appearance_opt.latent.parameter import Rates
 from appearance_opt.latent.positions import POSITIONS
 from appearance_opt.latent.subdivision import tessellate
 from appearance_opt.latent.texels import TEXELS, TexelCodec
+from appearance_opt.optimize import loop
+from appearance_opt.optimize.loop import FitOptions, pose_of
+from appearance_opt.optimize.validation import Validation
 from appearance_opt.reference.mesh import MeshReference
 from appearance_opt.reference.pool import ReferencePool
 from appearance_opt.reference.survey import MeshSurvey

@@ -10,8 +10,6 @@ from scipy.ndimage import distance_transform_edt
 
 from appearance_opt.asset.normals import weld
 from appearance_opt.baking.texel_points import texel_coverage
-from appearance_opt.fit.losses import LOSSES
-from appearance_opt.fit.step import Gradients, StepInputs
 from appearance_opt.initial.sphere import sphere
 from appearance_opt.latent.build import latent_of
 from appearance_opt.latent.displacement import DISPLACEMENT, Tessellator, footprint, share
@@ -21,6 +19,8 @@ from appearance_opt.latent.parameter import Rates
 from appearance_opt.latent.positions import POSITIONS
 from appearance_opt.latent.subdivision import tessellate
 from appearance_opt.latent.texels import TEXELS, TexelCodec, Texels
+from appearance_opt.optimize.losses import LOSSES
+from appearance_opt.optimize.step import Gradients, StepInputs
 from appearance_opt.reference.pool import Targets
 from appearance_opt.render.pixels import Grid
 from appearance_opt.render.quality import Quality

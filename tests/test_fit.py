@@ -15,12 +15,6 @@ from appearance_opt.asset import load
 from appearance_opt.asset.types import Asset
 from appearance_opt.config import SimplifyOptions, simplify_options
 from appearance_opt.errors import DivergedError, InputError, ReferenceRenderError
-from appearance_opt.fit import loop
-from appearance_opt.fit.checkpoint import Checkpointer, FitState
-from appearance_opt.fit.loop import FitOptions, fit
-from appearance_opt.fit.schedule import laplacian_weight
-from appearance_opt.fit.step import Gradients, StepInputs
-from appearance_opt.fit.validation import Validation
 from appearance_opt.initial.sphere import random_maps, sphere
 from appearance_opt.jobs.simplify import simplify
 from appearance_opt.latent.build import latent_of
@@ -28,6 +22,12 @@ from appearance_opt.latent.latent import Latent
 from appearance_opt.latent.parameter import Rates
 from appearance_opt.latent.positions import POSITIONS
 from appearance_opt.latent.texels import TEXELS, Texels
+from appearance_opt.optimize import loop
+from appearance_opt.optimize.checkpoint import Checkpointer, FitState
+from appearance_opt.optimize.loop import FitOptions, fit
+from appearance_opt.optimize.schedule import laplacian_weight
+from appearance_opt.optimize.step import Gradients, StepInputs
+from appearance_opt.optimize.validation import Validation
 from appearance_opt.reference.mesh import MeshReference
 from appearance_opt.reference.pool import ReferencePool
 from appearance_opt.render.quality import Quality

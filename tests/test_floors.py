@@ -14,7 +14,7 @@ FLOORS = (
     ("views", "backend", "placement", "options", "config", "progress", "interrupts", "doctor"),
     ("render",),
     ("latent", "reference", "baking", "initial"),
-    ("fit",),
+    ("optimize",),
     ("stages",),
     ("evaluate",),
     ("jobs",),

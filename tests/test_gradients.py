@@ -12,9 +12,6 @@ import pytest
 from appearance_opt.asset.normals import vertex_normals
 from appearance_opt.asset.tangents import split_and_tangents
 from appearance_opt.backend import to_device
-from appearance_opt.fit import adam
-from appearance_opt.fit.losses import LOSSES, Target, compared_pixels, image_loss
-from appearance_opt.fit.step import Gradients, StepInputs, first_non_finite, step
 from appearance_opt.initial.sphere import sphere
 from appearance_opt.latent.build import latent_of
 from appearance_opt.latent.laplacian import Laplacian
@@ -23,6 +20,9 @@ from appearance_opt.latent.mesh import LatentMesh, LatentTopology, local_edge_le
 from appearance_opt.latent.parameter import Rates
 from appearance_opt.latent.positions import POSITIONS
 from appearance_opt.latent.texels import TEXELS, TexelCodec, Texels
+from appearance_opt.optimize import adam
+from appearance_opt.optimize.losses import LOSSES, Target, compared_pixels, image_loss
+from appearance_opt.optimize.step import Gradients, StepInputs, first_non_finite, step
 from appearance_opt.reference.pool import Targets
 from appearance_opt.render import gradient
 from appearance_opt.render.images import render_image

@@ -14,12 +14,12 @@ from appearance_opt.asset import save
 from appearance_opt.asset.types import Asset, Mesh
 from appearance_opt.config import SimplifyOptions, simplify_options
 from appearance_opt.errors import InputError
-from appearance_opt.fit import adam
-from appearance_opt.fit.checkpoint import Checkpointer
 from appearance_opt.initial.sphere import sphere
 from appearance_opt.jobs.simplify import simplify
 from appearance_opt.latent.parameter import Parameter
 from appearance_opt.latent.smoothing import Smoother
+from appearance_opt.optimize import adam
+from appearance_opt.optimize.checkpoint import Checkpointer
 from appearance_opt.stages.growth import stretch
 from appearance_opt.stages.start import Start
 from appearance_opt.views import ViewSampler

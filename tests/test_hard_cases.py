@@ -10,8 +10,6 @@ import numpy as np
 import pytest
 
 from appearance_opt.asset.types import Asset, Material, Mesh, Texture
-from appearance_opt.fit.losses import LOSSES
-from appearance_opt.fit.step import Gradients, StepInputs
 from appearance_opt.initial.sphere import sphere
 from appearance_opt.latent.build import latent_of
 from appearance_opt.latent.export import to_asset
@@ -20,6 +18,8 @@ from appearance_opt.latent.mesh import LatentMesh
 from appearance_opt.latent.parameter import Rates
 from appearance_opt.latent.positions import POSITIONS
 from appearance_opt.latent.texels import TEXELS
+from appearance_opt.optimize.losses import LOSSES
+from appearance_opt.optimize.step import Gradients, StepInputs
 from appearance_opt.reference.mesh import MeshReference
 from appearance_opt.reference.pool import Targets
 from appearance_opt.render.images import render_image
@@ -413,7 +413,7 @@ def test_texels_at_their_bounds(end: int) -> None:
     model = model_of(sphere(100, (0.0, 0.0, 0.0), 1.0, 16), **bounds)
     check(model, SAMPLER.draw(0, 2))
     # a step beyond the bounds ends on them
-    from appearance_opt.fit import adam
+    from appearance_opt.optimize import adam
 
     parameter = model.parameters[TEXELS]
     push = mi.Float(np.full(dr.width(parameter.value), 1.0 if end == 0 else -1.0, np.float32))

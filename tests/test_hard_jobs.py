@@ -13,15 +13,15 @@ from appearance_opt.asset.types import Asset, Mesh
 from appearance_opt.config import SimplifyOptions, simplify_options
 from appearance_opt.errors import InputError, ReferenceRenderError
 from appearance_opt.evaluate.metrics import compare_images
-from appearance_opt.fit import loop
-from appearance_opt.fit.checkpoint import Checkpointer
-from appearance_opt.fit.loop import FitOptions, FitResult, fit
-from appearance_opt.fit.validation import Validation
 from appearance_opt.initial.sphere import sphere
 from appearance_opt.jobs.simplify import simplify
 from appearance_opt.latent.latent import Latent
 from appearance_opt.latent.mesh import LatentMesh
 from appearance_opt.latent.parameter import Rates
+from appearance_opt.optimize import loop
+from appearance_opt.optimize.checkpoint import Checkpointer
+from appearance_opt.optimize.loop import FitOptions, FitResult, fit
+from appearance_opt.optimize.validation import Validation
 from appearance_opt.reference.mesh import MeshReference
 from appearance_opt.reference.pool import ReferencePool
 from appearance_opt.views import Views

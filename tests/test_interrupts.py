@@ -13,9 +13,9 @@ import appearance_opt
 from appearance_opt.asset import load
 from appearance_opt.asset.types import Asset
 from appearance_opt.config import simplify_options
-from appearance_opt.fit.validation import Validation
 from appearance_opt.interrupts import Interrupts
 from appearance_opt.jobs import lifecycle as job
+from appearance_opt.optimize.validation import Validation
 
 
 def interrupt(number: int = signal.SIGINT) -> None:

@@ -11,14 +11,14 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from appearance_opt.fit.losses import LOSSES
-from appearance_opt.fit.step import Gradients
 from appearance_opt.initial.sphere import sphere
 from appearance_opt.latent.build import latent_of
 from appearance_opt.latent.latent import Latent
 from appearance_opt.latent.mesh import LatentMesh
 from appearance_opt.latent.parameter import Rates
 from appearance_opt.latent.positions import POSITIONS
+from appearance_opt.optimize.losses import LOSSES
+from appearance_opt.optimize.step import Gradients
 from appearance_opt.render import gradient, silhouette_walk
 from appearance_opt.render.drawn import Drawn
 from appearance_opt.render.edge_list import edge_list, walkable

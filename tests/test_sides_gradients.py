@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 from test_gradients import flat_maps, make_inputs
 from test_sides import joined, sheet
 
-from appearance_opt.fit.losses import LOSSES
-from appearance_opt.fit.step import Gradients
 from appearance_opt.initial.sphere import sphere
 from appearance_opt.latent.build import latent_of
 from appearance_opt.latent.mesh import LatentMesh
 from appearance_opt.latent.parameter import Rates
 from appearance_opt.latent.positions import POSITIONS
+from appearance_opt.optimize.losses import LOSSES
+from appearance_opt.optimize.step import Gradients
 from appearance_opt.render import gradient
 from appearance_opt.render.images import render_image
 from appearance_opt.render.pixels import Batch, Grid

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from appearance_opt.asset.types import Asset
-from appearance_opt.fit.loop import FitOptions, fit
+from appearance_opt.optimize.loop import FitOptions, fit
 from experiments.speed_vs_error import tables
 from experiments.speed_vs_error.recorder import Blind, Recorder
 from experiments.speed_vs_error.results import CurveRow, JobRow, read, write

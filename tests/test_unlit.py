@@ -13,12 +13,12 @@ from appearance_opt import bake, compare, simplify
 from appearance_opt.asset import Asset, Material, Mesh, Texture, load, save
 from appearance_opt.asset.types import srgb_to_linear
 from appearance_opt.config import bake_options, simplify_options, with_values
-from appearance_opt.fit.losses import LOSSES
-from appearance_opt.fit.step import Gradients
 from appearance_opt.jobs.inspect import inspect
 from appearance_opt.latent.build import latent_of
 from appearance_opt.latent.parameter import Rates
 from appearance_opt.latent.texels import TEXELS
+from appearance_opt.optimize.losses import LOSSES
+from appearance_opt.optimize.step import Gradients
 from appearance_opt.reference.mesh import MeshReference
 from appearance_opt.render.material import UNLIT
 from appearance_opt.render.pixels import Grid

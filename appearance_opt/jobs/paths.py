@@ -16,8 +16,8 @@ from appearance_opt.asset import check_folder, check_writable
 from appearance_opt.asset.paths import MAX_NAME
 from appearance_opt.asset.texture_files import SUFFIXES
 from appearance_opt.errors import InputError
-from appearance_opt.fit.archive import FILES as CHECKPOINT_FILES
 from appearance_opt.lock import lock_path, locked
+from appearance_opt.optimize.archive import FILES as CHECKPOINT_FILES
 from appearance_opt.options.files import OutputOptions
 from appearance_opt.publish import recover
 

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
     from appearance_opt.asset.types import Asset
     from appearance_opt.errors import DivergedError
-    from appearance_opt.fit.loop import FitResult
+    from appearance_opt.optimize.loop import FitResult
     from appearance_opt.stages.export import Exported
     from appearance_opt.stages.parts import Parts
 

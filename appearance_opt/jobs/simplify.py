@@ -11,7 +11,6 @@ from appearance_opt import __version__, backend
 from appearance_opt.config import SimplifyOptions, resolve_options
 from appearance_opt.digest import digest
 from appearance_opt.errors import InputError
-from appearance_opt.fit.checkpoint import Checkpointer
 from appearance_opt.jobs.lifecycle import (
     close_run,
     load_layout,
@@ -22,6 +21,7 @@ from appearance_opt.jobs.lifecycle import (
 )
 from appearance_opt.jobs.paths import Outputs
 from appearance_opt.jobs.result import SimplifyResult
+from appearance_opt.optimize.checkpoint import Checkpointer
 from appearance_opt.reference.subject import Subject
 from appearance_opt.stages.choice import choose_start
 from appearance_opt.stages.export import Exporter, export
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from appearance_opt.asset.types import Asset
-    from appearance_opt.fit.loop import Progress
+    from appearance_opt.optimize.loop import Progress
     from appearance_opt.stages.parts import Parts
     from appearance_opt.stages.run import Run
 

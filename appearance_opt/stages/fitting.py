@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from appearance_opt.errors import DivergedError
-from appearance_opt.fit.loop import FitOptions, FitResult, fit
-from appearance_opt.fit.validation import Validation
 from appearance_opt.initial.fill import fill
 from appearance_opt.latent.build import latent_of
 from appearance_opt.latent.displacement import DISPLACEMENT
 from appearance_opt.latent.latent import Latent
 from appearance_opt.latent.parameter import Rates
 from appearance_opt.latent.texels import Texels
+from appearance_opt.optimize.loop import FitOptions, FitResult, fit
+from appearance_opt.optimize.validation import Validation
 from appearance_opt.reference.pool import ReferencePool
 from appearance_opt.render.quality import Quality
 from appearance_opt.views import VALIDATION

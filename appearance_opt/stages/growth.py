@@ -17,8 +17,6 @@ import numpy as np
 
 from appearance_opt.config import with_values
 from appearance_opt.errors import InputError
-from appearance_opt.fit.loop import FitOptions, FitResult, fit
-from appearance_opt.fit.validation import Validation
 from appearance_opt.initial.atlas import unwrap
 from appearance_opt.initial.decimate import decimate
 from appearance_opt.initial.sphere import SMALLEST, random_maps, sphere
@@ -30,6 +28,8 @@ from appearance_opt.latent.latent import Latent
 from appearance_opt.latent.mesh import LatentMesh
 from appearance_opt.latent.parameter import Rates
 from appearance_opt.latent.positions import Positions
+from appearance_opt.optimize.loop import FitOptions, FitResult, fit
+from appearance_opt.optimize.validation import Validation
 from appearance_opt.reference.mesh import MeshReference
 from appearance_opt.reference.pool import ReferencePool
 from appearance_opt.reference.survey import MeshSurvey
@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from appearance_opt.config import SimplifyOptions
-    from appearance_opt.fit.loop import Progress
+    from appearance_opt.optimize.loop import Progress
     from appearance_opt.reference.subject import Subject
     from appearance_opt.views import ViewSampler
 

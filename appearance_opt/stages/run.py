@@ -13,8 +13,8 @@ from appearance_opt.stages.start import Start
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from appearance_opt.fit.checkpoint import Checkpointer
-    from appearance_opt.fit.loop import Progress
+    from appearance_opt.optimize.checkpoint import Checkpointer
+    from appearance_opt.optimize.loop import Progress
 
 EXPORT_SECONDS = 1.0
 """Time kept back from the budget for writing the result; the report has a reserve of its own."""

@@ -6,7 +6,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from appearance_opt.fit.losses import tone_map
+from appearance_opt.optimize.losses import tone_map
 from appearance_opt.render import brdf
 from appearance_opt.render.brdf import MaterialSample
 

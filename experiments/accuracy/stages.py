@@ -11,9 +11,9 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from appearance_opt.fit import losses
 from appearance_opt.initial.sphere import sphere
 from appearance_opt.latent import mesh_ops
+from appearance_opt.optimize import losses
 from appearance_opt.render import brdf, camera, coverage, surface
 from experiments.accuracy.double import double_arrays, in_double
 

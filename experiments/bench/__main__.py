@@ -106,10 +106,10 @@ def run_case(
 ) -> dict:
     """Median and range in ms of a whole step, the sum of its kernels, kernels compiled, peak
     memory."""
-    from appearance_opt.fit import adam
-    from appearance_opt.fit.loop import LOSS_EVERY
-    from appearance_opt.fit.losses import LOSSES
-    from appearance_opt.fit.step import Gradients, StepInputs, first_non_finite, step
+    from appearance_opt.optimize import adam
+    from appearance_opt.optimize.loop import LOSS_EVERY
+    from appearance_opt.optimize.losses import LOSSES
+    from appearance_opt.optimize.step import Gradients, StepInputs, first_non_finite, step
     from appearance_opt.options.views import ViewOptions
     from appearance_opt.reference.pool import ReferencePool, Targets
     from appearance_opt.render.pixels import Batch, Grid

@@ -15,11 +15,11 @@ import mitsuba as mi
 import numpy as np
 
 from appearance_opt import backend
-from appearance_opt.fit import adam
-from appearance_opt.fit.losses import LOSSES, Target, compared_pixels, covered_loss, image_loss
 from appearance_opt.latent.latent import Decoded
 from appearance_opt.latent.positions import POSITIONS
 from appearance_opt.latent.texels import TEXELS, Texels
+from appearance_opt.optimize import adam
+from appearance_opt.optimize.losses import LOSSES, Target, compared_pixels, covered_loss, image_loss
 from appearance_opt.render import gradient
 from appearance_opt.render.drawn import Shown
 from appearance_opt.render.freezing import Frozen

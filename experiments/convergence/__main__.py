@@ -19,7 +19,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from appearance_opt import backend
-from appearance_opt.fit.loop import fit
+from appearance_opt.optimize.loop import fit
 from appearance_opt.render.quality import Quality
 from experiments.convergence.cases import Case, make_case, names, source
 from experiments.convergence.plot import draw

@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 
 from appearance_opt.asset import load
 from appearance_opt.config import simplify_options
-from appearance_opt.fit.loop import FitOptions
-from appearance_opt.fit.validation import Validation
 from appearance_opt.initial.sphere import random_maps
 from appearance_opt.latent.build import latent_of
 from appearance_opt.latent.latent import Latent
 from appearance_opt.latent.parameter import Rates
 from appearance_opt.latent.positions import Positions
+from appearance_opt.optimize.loop import FitOptions
+from appearance_opt.optimize.validation import Validation
 from appearance_opt.reference.pool import ReferencePool
 from appearance_opt.reference.subject import Subject
 from appearance_opt.stages import growth

@@ -29,11 +29,11 @@ def measure(triangles: int, level: int) -> str:
     import drjit as dr
     import mitsuba as mi
 
-    from appearance_opt.fit.losses import LOSSES
-    from appearance_opt.fit.step import Gradients, StepInputs
     from appearance_opt.initial.sphere import sphere
     from appearance_opt.latent.build import latent_of
     from appearance_opt.latent.parameter import Rates
+    from appearance_opt.optimize.losses import LOSSES
+    from appearance_opt.optimize.step import Gradients, StepInputs
     from appearance_opt.reference.pool import Targets
     from appearance_opt.render.pixels import Grid
     from appearance_opt.render.quality import Quality

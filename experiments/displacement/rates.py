@@ -36,7 +36,7 @@ class Bench:
 
     def __init__(self, asset: str) -> None:
         from appearance_opt import backend, load, simplify_options
-        from appearance_opt.fit.validation import Validation
+        from appearance_opt.optimize.validation import Validation
         from appearance_opt.reference.pool import ReferencePool
         from appearance_opt.stages.decimated import decimate_start
         from appearance_opt.stages.fitting import point_width
@@ -58,9 +58,9 @@ class Bench:
     def run(self, case: str, steps: int) -> dict:
         """PSNR before, in the middle and after; seconds include the first rendering of the pool's
         views."""
-        from appearance_opt.fit.loop import FitOptions, fit
         from appearance_opt.latent.build import latent_of
         from appearance_opt.latent.parameter import Rates
+        from appearance_opt.optimize.loop import FitOptions, fit
         from appearance_opt.stages.fitting import fit_policy
 
         parts, numbers = case.split(":")

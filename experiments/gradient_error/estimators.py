@@ -9,11 +9,11 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from appearance_opt.fit.losses import LOSSES
-from appearance_opt.fit.step import Gradients, StepInputs
 from appearance_opt.latent.latent import Latent
 from appearance_opt.latent.parts import Pose
 from appearance_opt.latent.positions import POSITIONS, Positions
+from appearance_opt.optimize.losses import LOSSES
+from appearance_opt.optimize.step import Gradients, StepInputs
 from appearance_opt.reference.pool import Targets
 from appearance_opt.render.pixels import Grid
 from appearance_opt.render.quality import Quality

@@ -17,12 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from appearance_opt import backend
-from appearance_opt.fit.losses import LOSSES
-from appearance_opt.fit.step import Gradients, StepInputs
 from appearance_opt.initial.sphere import sphere
 from appearance_opt.latent.build import latent_of
 from appearance_opt.latent.parameter import Rates
 from appearance_opt.latent.texels import TEXELS, TexelCodec, Texels
+from appearance_opt.optimize.losses import LOSSES
+from appearance_opt.optimize.step import Gradients, StepInputs
 from appearance_opt.reference.pool import Targets
 from appearance_opt.render.images import render_image
 from appearance_opt.render.pixels import Batch, Grid

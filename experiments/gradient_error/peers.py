@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from appearance_opt.fit.losses import LOSSES
+from appearance_opt.optimize.losses import LOSSES
 from experiments import mitsuba_peer
 from experiments.gradient_error.problems import BACKGROUND, Problem
 

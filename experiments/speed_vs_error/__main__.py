@@ -50,7 +50,7 @@ def main() -> None:
         write_docs(a.seconds)
         return
     # told of every fit that is stopped to be gone on with at another resolution
-    logging.getLogger("appearance_opt.fit.loop").addFilter(
+    logging.getLogger("appearance_opt.optimize.loop").addFilter(
         lambda record: "interrupted" not in record.msg
     )
     subjects, levers = [s for s in _chosen(SUBJECTS, a.scenes) if _is_there(s)], _levers(a.levers)

@@ -12,8 +12,8 @@ if TYPE_CHECKING:
 
     import mitsuba as mi
 
-    from appearance_opt.fit.checkpoint import FitState
     from appearance_opt.latent.latent import Latent
+    from appearance_opt.optimize.checkpoint import FitState
 
 
 @dataclass(frozen=True)

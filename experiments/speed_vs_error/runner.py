@@ -10,11 +10,11 @@ from unittest import mock
 import drjit as dr
 import numpy as np
 
-from appearance_opt.fit.loop import FitOptions, fit
-from appearance_opt.fit.validation import Validation
 from appearance_opt.latent.build import latent_of
 from appearance_opt.latent.parameter import Rates
 from appearance_opt.latent.positions import Positions
+from appearance_opt.optimize.loop import FitOptions, fit
+from appearance_opt.optimize.validation import Validation
 from appearance_opt.reference.pool import ReferencePool
 from appearance_opt.stages.fitting import VALIDATION_VIEWS, fit_policy
 from appearance_opt.views import VALIDATION
@@ -32,7 +32,7 @@ FRACTIONS = (1 / 16, 1 / 8, 1 / 4, 1 / 2)
 
 WARM_UP_STEPS = 12
 """Steps of a fit that is thrown away before each: kernels are compiled or loaded in it. More than
-``fit.loop.LOSS_EVERY``, so that both kinds of step occur."""
+``optimize.loop.LOSS_EVERY``, so that both kinds of step occur."""
 
 CONSTANT = {
     "red": 0.2, "green": 0.2, "blue": 0.2, "roughness": 0.5, "metalness": 0.0,
@@ -66,7 +66,7 @@ def run(bench: Bench, setup: Setup, seconds: float) -> Run:
             patches.enter_context(mock.patch("appearance_opt.latent.texels.MAX_LEVELS", 1))
         if not setup.laplacian_decays:
             patches.enter_context(
-                mock.patch("appearance_opt.fit.loop.laplacian_weight", lambda first, _: first)
+                mock.patch("appearance_opt.optimize.loop.laplacian_weight", lambda first, _: first)
             )
         return Run(
             bench, start, _timed(bench, start, setup, seconds), (setup.texture, setup.closed_form)

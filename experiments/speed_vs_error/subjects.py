@@ -123,7 +123,7 @@ class Bench:
 
     @cached_property
     def _camera(self):
-        from appearance_opt.fit.validation import Validation
+        from appearance_opt.optimize.validation import Validation
 
         return Validation(self.reference, self._views, RESOLUTION, SAMPLES)
 

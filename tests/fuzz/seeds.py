@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from appearance_opt.asset import save
-from appearance_opt.fit import archive
+from appearance_opt.optimize import archive
 from tests.conftest import make_asset
 
 FINGERPRINT = "the job of the seeds"

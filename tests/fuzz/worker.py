@@ -19,7 +19,7 @@ from pathlib import Path
 from appearance_opt.asset import images, load
 from appearance_opt.config import read_toml, simplify_options
 from appearance_opt.errors import InputError
-from appearance_opt.fit import archive
+from appearance_opt.optimize import archive
 from tests.fuzz.mutators import mutate
 from tests.fuzz.seeds import FINGERPRINT, SEEDS
 

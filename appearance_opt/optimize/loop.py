@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Protocol, TypeVar
 import numpy as np
 
 from appearance_opt.errors import DivergedError
-from appearance_opt.fit import adam
-from appearance_opt.fit.checkpoint import Checkpointer, FitState
-from appearance_opt.fit.losses import loss_of_name
-from appearance_opt.fit.schedule import Clock, laplacian_weight, learning_rate
-from appearance_opt.fit.step import Gradients, StepInputs, StepResult, first_non_finite, step
-from appearance_opt.fit.validation import Validation
+from appearance_opt.optimize import adam
+from appearance_opt.optimize.checkpoint import Checkpointer, FitState
+from appearance_opt.optimize.losses import loss_of_name
+from appearance_opt.optimize.schedule import Clock, laplacian_weight, learning_rate
+from appearance_opt.optimize.step import Gradients, StepInputs, StepResult, first_non_finite, step
+from appearance_opt.optimize.validation import Validation
 from appearance_opt.render.display import BACKGROUND as GREY
 from appearance_opt.render.pixels import Grid
 from appearance_opt.render.quality import Quality

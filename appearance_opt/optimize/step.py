@@ -9,8 +9,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from appearance_opt.fit import adam
-from appearance_opt.fit.losses import Target, compared_pixels, covered_loss, image_loss
+from appearance_opt.optimize import adam
+from appearance_opt.optimize.losses import Target, compared_pixels, covered_loss, image_loss
 from appearance_opt.render import gradient
 from appearance_opt.render.drawn import Shown
 from appearance_opt.render.freezing import Frozen, traced
@@ -19,10 +19,10 @@ from appearance_opt.render.pixels import Batch
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-    from appearance_opt.fit.losses import Loss
     from appearance_opt.latent.laplacian import Laplacian
     from appearance_opt.latent.latent import Decoded, Latent, Values
     from appearance_opt.latent.parts import Pose
+    from appearance_opt.optimize.losses import Loss
     from appearance_opt.reference.pool import Targets
     from appearance_opt.render.freezing import Run
     from appearance_opt.render.pixels import Grid

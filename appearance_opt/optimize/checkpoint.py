@@ -14,9 +14,9 @@ import numpy as np
 
 from appearance_opt.digest import digest
 from appearance_opt.errors import InputError
-from appearance_opt.fit import archive
-from appearance_opt.fit.adam import Moments
 from appearance_opt.lock import FOLDER_LOCK
+from appearance_opt.optimize import archive
+from appearance_opt.optimize.adam import Moments
 
 if TYPE_CHECKING:
     from collections.abc import Callable
