@@ -266,7 +266,7 @@ def test_instances(tmp_path: Path) -> None:
 def test_extensions_that_a_file_requires(tmp_path: Path) -> None:
     for name, fine in (
         ("KHR_materials_clearcoat", True),
-        ("KHR_lights_punctual", True),
+        ("KHR_animation_pointer", True),
         ("ACME_voxels", False),
     ):
         write_glb(

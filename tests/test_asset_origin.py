@@ -146,7 +146,7 @@ def test_only_what_faces_use_says_how_far_away_it_is() -> None:
 @pytest.mark.parametrize("suffix", [".glb", ".gltf", ".usda", ".usdz", ".obj"])
 def test_the_place_is_written(tmp_path: Path, suffix: str) -> None:
     asset = load(write(tmp_path, "glb"))
-    save(asset, tmp_path / f"again{suffix}")
+    save(replace(asset, nodes=()), tmp_path / f"again{suffix}")
     again = load(tmp_path / f"again{suffix}")
     # OBJ has the nine digits that single precision needs, as for what lies near
     np.testing.assert_allclose(corners(again), corners(asset), atol=0.01 * MICROMETRE)

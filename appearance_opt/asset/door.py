@@ -90,6 +90,7 @@ def with_text_names(asset: Asset) -> Asset:
     return replace(
         asset,
         meshes=tuple(meshes),
+        nodes=tuple(replace(n, name=_text(n.name)) for n in asset.nodes),
         notes=tuple(one_line(without_stray_bytes(note)) for note in asset.notes),
     )
 

@@ -53,6 +53,7 @@ class MaterialReader:
         # what several materials read is one texture, as in the file
         self._read_textures: dict[tuple[int, str, tuple[Wrap, Wrap]], Texture] = {}
         self._materials: dict[int | None, tuple[Material, list[int]]] = {}
+        self.sets_read: dict[int | None, list[int]] = {}  # sets of texture coordinates by material
         self._transforms: dict[int, dict[str, uv_transforms.UvTransform]] = {}
         self._tiles: dict[int, Callable[[Tile], Material]] = {}
         self._tile: Tile | None = None  # the one that is read
@@ -82,6 +83,7 @@ class MaterialReader:
         """(material, numbers of the sets of texture coordinates that its textures read)."""
         if index not in self._materials:
             self._materials[index] = self._place(index), self._sets(index)
+            self.sets_read[index] = self._sets(index)
         return self._materials[index]
 
     def apply_uv_transforms(self, meshes: list[Mesh], keep_layout: bool = False) -> list[Mesh]:

@@ -49,6 +49,12 @@ class Nodes:
                 out[k] = np.array(node["matrix"], np.float64).reshape(4, 4).T
         return out
 
+    @cached_property
+    def joints(self) -> frozenset[int]:
+        """Nodes that belong to skeletons."""
+        skins = self.document.items("skins")
+        return frozenset(j for skin in skins for j in skin.get("joints", []))
+
     def roots(self) -> list[int]:
         """The nodes that are no one's children."""
         return [k for k in range(len(self.nodes)) if k not in self._parents]

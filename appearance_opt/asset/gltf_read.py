@@ -9,20 +9,22 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from appearance_opt.asset import uv_transforms
+from appearance_opt.asset import hierarchy, uv_transforms
 from appearance_opt.asset.alpha import list_names
 from appearance_opt.asset.batch import Batch, in_range, replace_chosen
 from appearance_opt.asset.gltf_accessors import Document
 from appearance_opt.asset.gltf_draco import DRACO, Compressed
+from appearance_opt.asset.gltf_dropped import COUNTED, note_dropped
 from appearance_opt.asset.gltf_materials import READ_EXTENSIONS, VARIANTS, MaterialReader
 from appearance_opt.asset.gltf_meshopt import MESHOPT
 from appearance_opt.asset.gltf_nodes import INSTANCING, Nodes
 from appearance_opt.asset.gltf_rig import RigReader
+from appearance_opt.asset.hierarchy import OF_MESH
 from appearance_opt.asset.influences import on_bone
 from appearance_opt.asset.instances import place_copies
 from appearance_opt.asset.normals import unit
 from appearance_opt.asset.origin import ZERO, settle
-from appearance_opt.asset.types import Asset, Contents, Mesh
+from appearance_opt.asset.types import Asset, Contents, Credits, Mesh, Node
 from appearance_opt.errors import InputError
 
 if TYPE_CHECKING:
@@ -61,6 +63,9 @@ def load_gltf(
     return _Reader(document, keep_layout, variant, keep_rig).asset()
 
 
+_OF_MESH = {"name", "mesh", "translation", "scale"}
+
+
 class _Reader:
     def __init__(
         self, document: Document, keep_layout: bool, variant: str | None, keep_rig: bool
@@ -76,6 +81,8 @@ class _Reader:
         self._sharers = Counter(p.get("attributes", {}).get("POSITION") for p in primitives)
         self._uses = Counter(node["mesh"] for node in document.items("nodes") if "mesh" in node)
         self._local: dict[tuple[int, int, tuple[float, ...]], Mesh] = {}
+        self._hierarchy: list[Node] = []
+        self._joints: set[int] = set()  # numbers in the hierarchy
 
     def asset(self) -> Asset:
         self._check_extensions()
@@ -83,7 +90,7 @@ class _Reader:
         self.document.companions.budget.take(self.nodes.visits(roots), "nodes", self.path)
         if self.keep_rig and (self.document.items("skins") or self.document.items("animations")):
             self.rig = RigReader(self.nodes, roots)
-        drawn = [place for root in roots for place in self._drawn(root, np.eye(4))]
+        drawn = [place for root in roots for place in self._drawn(root, np.eye(4), None)]
         parts = {k: self._primitives(*drawn[k]) for k in self._order(drawn)}
         meshes = [mesh for k in range(len(drawn)) for mesh in parts[k]]
         rig = None if self.rig is None else self.rig.rig()
@@ -102,10 +109,23 @@ class _Reader:
         if not self.keep_layout:
             meshes = self._flat_where_needed(meshes)
         meshes = self.materials.apply_uv_transforms(meshes, self.keep_layout)
-        notes = self.document.companions.notes.lines()
-        return Asset(
-            tuple(meshes), self.path.stem, notes, origin=origin, contents=self._contents(), rig=rig
+        note_dropped(self.document, self.materials.sets_read)
+        asset = Asset(
+            tuple(meshes),
+            self.path.stem,
+            self.document.companions.notes.lines(),
+            origin=origin,
+            contents=self._contents(),
+            nodes=() if rig is not None else tuple(self._hierarchy),
+            credits=self._credits(),
+            rig=rig,
         )
+        kept = (k for k in range(len(asset.nodes)) if k not in self._joints)
+        return hierarchy.without_idle_nodes(asset, kept)
+
+    def _credits(self) -> Credits:
+        about = self.document.json["asset"]
+        return Credits(str(about.get("copyright", "")), about.get("extras"))
 
     def _contents(self) -> Contents:
         def names(items: list[dict[str, Any]], kind: str) -> tuple[str, ...]:
@@ -139,19 +159,30 @@ class _Reader:
                     f"{self.path}: requires the extension '{name}', which is not supported; save it without"
                 )
         for name in self.document.json.get("extensionsUsed", []):
-            if name not in _READ:
+            if name not in _READ and name not in COUNTED:
                 self.note(f"extension {name} ignored")
 
-    def _drawn(self, index: int, parent: NDArray) -> Iterator[tuple[int, NDArray]]:
-        """(node, its transform to the world) of a node and those below it that have a mesh."""
-        node = self.document.items("nodes")[index]
-        world = parent @ self.nodes.local[index]
+    def _drawn(
+        self, index: int, above: NDArray, parent: int | None
+    ) -> Iterator[tuple[int, NDArray, int]]:
+        """(node, its transform to the world, its number in the hierarchy) of a node and those below
+        it that have a mesh. ``above``: the transform of its ``parent`` there."""
+        node, local = self.document.items("nodes")[index], self.nodes.local[index]
+        world, number = above @ local, len(self._hierarchy)
+        name = str(node.get("name", f"node{index}"))
+        if parent is not None and name == f"{self._hierarchy[parent].name}{OF_MESH}":
+            # what our writer hangs below a node, to bring its mesh to its place
+            number = parent if node.keys() <= _OF_MESH else number
+        if number != parent:
+            self._hierarchy.append(Node(name, parent, local, node.get("extras")))
+        if index in self.nodes.joints:
+            self._joints.add(number)
         if "mesh" in node:
-            yield index, world
+            yield index, world, number
         for child in node.get("children", []):
-            yield from self._drawn(child, world)
+            yield from self._drawn(child, world, number)
 
-    def _order(self, drawn: list[tuple[int, NDArray]]) -> list[int]:
+    def _order(self, drawn: list[tuple[int, NDArray, int]]) -> list[int]:
         """In which order meshes are read: with a rig, skinned ones first, which say where the
         bind space is."""
         nodes, order = self.document.items("nodes"), list(range(len(drawn)))
@@ -161,8 +192,9 @@ class _Reader:
             else sorted(order, key=lambda k: "skin" not in nodes[drawn[k][0]])
         )
 
-    def _primitives(self, index: int, world: NDArray) -> list[Mesh]:
-        """The triangles of a node's mesh at every place at which the node puts them."""
+    def _primitives(self, index: int, world: NDArray, number: int) -> list[Mesh]:
+        """The triangles of a node's mesh at every place at which the node puts them. ``number``: of
+        the node in the hierarchy."""
         node = self.document.items("nodes")[index]
         mesh = self.document.items("meshes")[node["mesh"]]
         name = node.get("name") or mesh.get("name") or f"mesh{node['mesh']}"
@@ -173,7 +205,8 @@ class _Reader:
             self._primitive(p, k, index, world, name if k == 0 else f"{name}.{k}", weights)
             for k, p in enumerate(mesh["primitives"])
         ]
-        return [m for m in found if m is not None]
+        owner = None if self.rig is not None else number
+        return [replace(m, node=owner) for m in found if m is not None]
 
     def _mention_targets(self, mesh: dict[str, Any], name: str) -> None:
         """Note the morph targets of a mesh by the names that exporters give them."""

@@ -26,12 +26,14 @@ from appearance_opt.asset.gltf_materials import (
 from appearance_opt.asset.gltf_rig_write import RigWriter
 from appearance_opt.asset.height import as_16_bit, height_png
 from appearance_opt.asset.hierarchy import Transform
+from appearance_opt.asset.origin import ZERO
 from appearance_opt.asset.quantize import Grid
 from appearance_opt.asset.sides import apart_from_sides
 from appearance_opt.asset.texture_files import Slot, encode_all
 
 if TYPE_CHECKING:
     from appearance_opt.asset.file_options import FileOptions, MapKind
+    from appearance_opt.asset.origin import Origin
     from appearance_opt.asset.types import Asset, ColorSpace, Displacement, Material, Mesh, Texture
 
 _WRAPS = {"repeat": 10497, "clamp": 33071, "mirror": 33648}
@@ -137,11 +139,10 @@ class _Writer:
         loose = [asset.meshes[k] for k in groups.pop(None, [])]
         for number, members in groups.items():
             assert number is not None
-            meshes = [
-                hierarchy.in_coordinates(asset.meshes[k], world[number], asset.origin)
-                for k in members
-            ]
-            self._hang(meshes, nodes[number], nodes)
+            meshes, offset = hierarchy.in_coordinates(
+                [asset.meshes[k] for k in members], world[number], asset.origin
+            )
+            self._hang(meshes, offset, nodes[number], nodes)
         grid, first = self._grid(loose), len(nodes)
         nodes += [{"name": m.name, **self._shown([m], m.name, grid)} for m in loose]
         beside = list(range(first, len(nodes)))
@@ -168,16 +169,22 @@ class _Writer:
             rig.nodes.append({"name": mesh.name, "mesh": shown, "skin": 0})
         self.json |= rig.finish(self.buffers, grid)
 
-    def _hang(self, meshes: list[Mesh], node: dict[str, Any], nodes: list[dict[str, Any]]) -> None:
-        """Let a node show meshes in its coordinates. What undoes a grid gets a node of its own
-        below it, so that the pivot stays."""
+    def _hang(
+        self,
+        meshes: list[Mesh],
+        offset: Origin,
+        node: dict[str, Any],
+        nodes: list[dict[str, Any]],
+    ) -> None:
+        """Let a node show meshes at a place in its coordinates. What brings them there, or undoes a
+        grid, gets a node of its own below it, so that the pivot stays."""
         name = node.get("name", "mesh")
-        shown = self._shown(meshes, name, self._grid(meshes))
+        shown = self._shown(meshes, name, self._grid(meshes), offset)
         if len(shown) == 1:
             node |= shown
             return
         node.setdefault("children", []).append(len(nodes))
-        nodes.append({"name": f"{name}_mesh", **shown})
+        nodes.append({"name": f"{name}{hierarchy.OF_MESH}", **shown})
 
     def _grid(self, meshes: list[Mesh]) -> Grid | None:
         """The grid of meshes whose positions are to be quantised. Not of those whose thickness the
@@ -187,16 +194,22 @@ class _Writer:
             return None
         return Grid.around([m.positions for m in meshes])
 
-    def _shown(self, meshes: list[Mesh], name: str, grid: Grid | None) -> dict[str, Any]:
-        """What a node says that shows meshes: as one of the file, and what undoes their grid."""
+    def _shown(
+        self, meshes: list[Mesh], name: str, grid: Grid | None, offset: Origin = ZERO
+    ) -> dict[str, Any]:
+        """What a node says that shows meshes at a place: as one of the file, and what undoes their
+        grid."""
         primitives = []
         for mesh in meshes:
             primitive = self.buffers.primitive(mesh, grid)
             primitives.append({**primitive, "material": self._number(mesh.material)})
         self.json["meshes"].append({"name": name, "primitives": primitives})
         out: dict[str, Any] = {"mesh": len(self.json["meshes"]) - 1}
+        place = np.add(offset, ZERO if grid is None else grid.low).tolist()
+        if any(place):
+            out["translation"] = place
         if grid is not None:
-            out |= {"translation": list(grid.low), "scale": [grid.scale] * 3}
+            out["scale"] = [grid.scale] * 3
         return out
 
     def _number(self, material: Material) -> int:

@@ -8,13 +8,18 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from appearance_opt.asset.instances import Instances, place_copies
+from appearance_opt.asset.origin import ZERO, settle
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
     from numpy.typing import NDArray
 
+    from appearance_opt.asset.origin import Origin
     from appearance_opt.asset.types import Asset, Mesh, Node
+
+OF_MESH = "_mesh"
+"""What follows the name of a node in that of a node which brings its mesh to its place."""
 
 SHEAR = 1e-5
 """By how much translation, rotation and scale may miss a matrix, relative to its largest number:
@@ -46,7 +51,8 @@ def place_nodes(nodes: Sequence[Node]) -> tuple[list[Transform], NDArray[np.floa
         local = np.linalg.solve(above, wanted[k])
         found = decompose(local)
         if found is None:
-            found = Transform(tuple(local[:3, 3].tolist()))
+            place = local[:3, 3] if np.isfinite(local).all() else np.zeros(3)
+            found = Transform(tuple(place.tolist()))
         transforms.append(found)
         world[k] = above @ compose_one(found)
     return transforms, world
@@ -83,14 +89,18 @@ def compose_one(t: Transform) -> NDArray[np.float64]:
     return out
 
 
-def in_coordinates(mesh: Mesh, world: NDArray, origin: Sequence[float]) -> Mesh:
-    """A mesh of the world, at ``origin``, in the coordinates of a node that ``world`` (4, 4) brings
-    to the world. Positions in single precision."""
+def in_coordinates(
+    meshes: Sequence[Mesh], world: NDArray, origin: Sequence[float]
+) -> tuple[list[Mesh], Origin]:
+    """Meshes of the world, at ``origin``, in the coordinates of a node that ``world`` (4, 4) brings
+    to the world: (with positions in single precision, relative to a place in its coordinates; that
+    place, zero unless they lie far from the pivot)."""
     back = np.linalg.inv(world) @ _translation(origin)
     if np.array_equal(back, np.eye(4)):
-        return mesh
-    put = place_copies(mesh, Instances(back[None]), mesh.name)
-    return replace(put, positions=put.positions.astype(np.float32), node=mesh.node)
+        return list(meshes), ZERO
+    place = Instances(back[None])
+    put = [replace(place_copies(m, place, m.name), node=m.node) for m in meshes]
+    return settle(put, lambda _: None)
 
 
 def _translation(offset: Sequence[float]) -> NDArray[np.float64]:

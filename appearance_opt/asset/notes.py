@@ -62,3 +62,8 @@ class Notes:
             number = "" if kind.total is None else f"{kind.total} "
             out.append(f"{plural} {listed}{more}: {number}{rest[0]}".lstrip())
         return tuple(out)
+
+
+def counted(number: int, one: str, many: str = "") -> str:
+    """A number of things: "1 mesh", "2 meshes"; ``many``: their plural, if it is not ``one``s."""
+    return f"{number:,} {one if number == 1 else many or one + 's'}"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,7 +16,7 @@ from appearance_opt.asset.origin import settle
 from appearance_opt.asset.paths import read_text
 from appearance_opt.asset.polygons import Polygons, triangulate
 from appearance_opt.asset.rows import unique_rows
-from appearance_opt.asset.types import Asset, Material, Mesh, srgb_to_linear
+from appearance_opt.asset.types import Asset, Material, Mesh, Node, srgb_to_linear
 from appearance_opt.errors import InputError, MissingFileError
 
 if TYPE_CHECKING:
@@ -52,12 +53,13 @@ class _Parser:
         self.uvs: list[list[float]] = []
         self.normals: list[list[float]] = []
         # by material, and by what the corners have: texture coordinates, normals
-        self.polygons: dict[tuple[str, bool, bool], list[list[tuple[int, int, int]]]] = {}
+        self.polygons: dict[tuple[str, bool, bool, str], list[list[tuple[int, int, int]]]] = {}
         # the smoothing groups of the same polygons, numbered by their names; 0 is none
-        self.groups: dict[tuple[str, bool, bool], list[int]] = {}
+        self.groups: dict[tuple[str, bool, bool, str], list[int]] = {}
         self.group, self.says_groups = 0, False
         self.group_numbers: dict[str, int] = {}
         self.current = ""
+        self.object = ""
         self.materials = MaterialReader(companions)
         self.companions = companions
 
@@ -78,11 +80,13 @@ class _Parser:
                 self.companions.note("faces with fewer than three corners ignored")
                 return
             has_uv, has_normal = (all(c[k] >= 0 for c in corners) for k in (1, 2))
-            key_of = (self.current, has_uv, has_normal)
+            key_of = (self.current, has_uv, has_normal, self.object)
             self.polygons.setdefault(key_of, []).append(corners)
             self.groups.setdefault(key_of, []).append(self.group)
         elif key == "s":
             self._smooth(words[1] if len(words) > 1 else "1")
+        elif key == "o":
+            self.object = line[line.index(key) + 1 :].strip()
         elif key == "usemtl":
             self.current = line[line.index(key) + len(key) :].strip()
         elif key == "mtllib":
@@ -137,9 +141,10 @@ class _Parser:
                 self.companions.note(
                     f"material '{name}': not defined, the default material is used"
                 )
+        objects = {name: k for k, name in enumerate(dict.fromkeys(p[3] for p in self.polygons))}
         read = [
             self._mesh(name, has_uv and there[0], has_normal and there[1], polygons)
-            for (name, has_uv, has_normal), polygons in self.polygons.items()
+            for (name, has_uv, has_normal, _), polygons in self.polygons.items()
         ]
         meshes, origin = settle([mesh for mesh, _ in read], self.companions.note)
         if not keep_layout:
@@ -150,7 +155,16 @@ class _Parser:
             ]
             meshes = add_normals(meshes, groups if self.says_groups else None, crease_angle)
         meshes = self.materials.apply_uv_transforms(meshes, keep_layout)
-        return Asset(tuple(meshes), self.path.stem, self.companions.notes.lines(), origin=origin)
+        if len(objects) > 1:
+            numbers = [objects[key[3]] for key in self.polygons]
+            meshes = [replace(m, node=n) for m, n in zip(meshes, numbers, strict=True)]
+        return Asset(
+            tuple(meshes),
+            self.path.stem,
+            self.companions.notes.lines(),
+            origin=origin,
+            nodes=tuple(Node(n or self.path.stem) for n in objects) if len(objects) > 1 else (),
+        )
 
     def _mesh(
         self, name: str, has_uv: bool, has_normal: bool, polygons: list[list[tuple[int, int, int]]]

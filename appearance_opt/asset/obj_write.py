@@ -43,12 +43,15 @@ def save_obj(asset: Asset, path: Path, options: FileOptions = PLAIN) -> None:
         mtl += _mtl_lines(replace(m, name=named[key]), path, options)
     path.with_suffix(".mtl").write_text("\n".join(mtl) + "\n", encoding="utf-8")
     lines = ["# appearance-opt", f"mtllib {path.stem}.mtl"]
+    if asset.credits.copyright:
+        lines.insert(1, f"# copyright: {' '.join(asset.credits.copyright.split())}")
     start = np.ones(
         3, np.int64
     )  # of this mesh's positions, texture coordinates and normals in the whole file
     for mesh in asset.meshes:
+        name = asset.nodes[mesh.node].name if asset.nodes and mesh.node is not None else mesh.name
         lines += [
-            f"o {' '.join(mesh.name.split())}",
+            f"o {' '.join(name.split())}",
             f"usemtl {named[look[id(mesh.material)]]}",
             *_vertices(mesh, asset.origin),
         ]

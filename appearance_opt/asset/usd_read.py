@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from appearance_opt.asset import usd_shapes, uv_transforms
+from appearance_opt.asset import usd_nodes, usd_shapes, uv_transforms
 from appearance_opt.asset.alpha import OPAQUE, list_names
 from appearance_opt.asset.batch import fill_normals
 from appearance_opt.asset.companions import Companions
@@ -248,6 +248,7 @@ class _Reader:
         self.time = Usd.TimeCode.EarliestTime()
         self.cache = UsdGeom.XformCache(self.time)
         self._read: dict[tuple[str, ...], list[Mesh]] = {}
+        self.prims = usd_nodes.Prims(self.cache, self.to_metres)
         self.rig = (
             RigReader(stage, path, self.to_metres, self.time, self.note) if keep_rig else None
         )
@@ -261,9 +262,10 @@ class _Reader:
         for prim in prims:
             if prim.IsA(UsdGeom.PointInstancer):
                 prims.PruneChildren()  # its prototypes are drawn where it says
-                meshes += self._instances(prim)
+                meshes += self.prims.own(prim, self._instances(prim))
             elif prim.IsA(UsdGeom.Gprim) and self._shown(prim):
-                meshes += [self._put_one(prim, part) for part in self._parts(prim)]
+                parts = [self._put_one(prim, part) for part in self._parts(prim)]
+                meshes += self.prims.own(prim, parts)
         meshes = self.materials.apply_uv_transforms(meshes, self.keep_layout)
         rig = None if self.rig is None else self.rig.rig()
         origin = ZERO
@@ -271,9 +273,16 @@ class _Reader:
             meshes, origin = settle(meshes, self.note)
         else:
             meshes = [replace(m, positions=m.positions.astype(np.float32)) for m in meshes]
-        notes = self.companions.notes.lines()
+        usd_nodes.note_dropped(self.stage, self.note)
         return Asset(
-            tuple(meshes), self.path.stem, notes, origin=origin, contents=self._contents(), rig=rig
+            tuple(meshes),
+            self.path.stem,
+            self.companions.notes.lines(),
+            origin=origin,
+            contents=self._contents(),
+            nodes=() if rig is not None else tuple(self.prims.nodes),
+            credits=usd_nodes.credits_of(self.stage),
+            rig=rig,
         )
 
     def _contents(self) -> Contents:

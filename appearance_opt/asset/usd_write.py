@@ -14,10 +14,13 @@ from appearance_opt.asset.alpha import coverage, kind_of
 from appearance_opt.asset.encoding import encoded_for
 from appearance_opt.asset.file_options import PLAIN
 from appearance_opt.asset.height import as_16_bit, height_png
+from appearance_opt.asset.hierarchy import in_coordinates
+from appearance_opt.asset.origin import ZERO
 from appearance_opt.asset.paths import MAX_NAME
 from appearance_opt.asset.rows import unique_rows
 from appearance_opt.asset.sides import apart_from_sides
 from appearance_opt.asset.texture_files import Slot, TextureFile, encode, encode_pixels
+from appearance_opt.asset.usd_nodes import COPYRIGHT, write_nodes
 from appearance_opt.asset.usd_rig_write import RigWriter
 
 if TYPE_CHECKING:
@@ -62,15 +65,25 @@ def _write_stage(asset: Asset, root: Path, textures: str, options: FileOptions) 
     stage = Usd.Stage.CreateNew(str(root))
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
-    name = Tf.MakeValidIdentifier(asset.name)
+    roots = [n.name for n in asset.nodes if n.parent is None]
+    hung = asset.rig is None and all(m.node is not None for m in asset.meshes)
+    name = Tf.MakeValidIdentifier(roots[0] if len(roots) == 1 and hung else asset.name)
     kind = UsdGeom.Xform if asset.rig is None else UsdSkel.Root
     top = kind.Define(stage, f"/{name}")
     stage.SetDefaultPrim(top.GetPrim())
     Usd.ModelAPI(top.GetPrim()).SetKind(Kind.Tokens.component)
-    if any(asset.origin):
+    if asset.credits.copyright:
+        stage.GetRootLayer().customLayerData = {COPYRIGHT: asset.credits.copyright}
+    paths, world = write_nodes(stage, f"/{name}", asset)
+    if any(asset.origin) and not paths:
         top.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Vec3d(*asset.origin))
     UsdGeom.Scope.Define(stage, f"/{name}/Materials")
     rig = None if asset.rig is None else RigWriter(stage, f"/{name}", asset, asset.rig)
+    loose = f"/{name}"
+    if paths and any(asset.origin) and not hung:
+        loose = f"/{name}/Beside"
+        beside = UsdGeom.Xform.Define(stage, loose)
+        beside.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Vec3d(*asset.origin))
     materials: dict[tuple[tuple, bool, bool], Any] = {}
     for k, mesh in enumerate(asset.meshes):
         key = (apart_from_sides(mesh.material), _colored(mesh), _veiled(mesh))
@@ -79,22 +92,29 @@ def _write_stage(asset: Asset, root: Path, textures: str, options: FileOptions) 
             target = f"/{name}/Materials/M{len(materials)}_{word}"
             preview = _Preview(stage, target, root.parent / textures, options)
             materials[key] = _material(preview, mesh.material, key[1], key[2])
-        parent = _parent(stage, name, k, len(asset.meshes))
+        if mesh.node is not None and paths:
+            parent = paths[mesh.node]
+            (mesh,), offset = in_coordinates([mesh], world[mesh.node], asset.origin)
+        else:
+            offset = ZERO
+            parent = _parent(stage, loose, k, len(asset.meshes))
         target = f"{parent}/G{k}_{Tf.MakeValidIdentifier(mesh.name)}"
         _mesh(stage, target, mesh, materials[key], rig)
+        if any(offset):
+            shape = UsdGeom.Xformable.Get(stage, target)
+            shape.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Vec3d(*offset))
     stage.GetRootLayer().Save()
 
 
-def _parent(stage: Any, name: str, number: int, count: int) -> str:
+def _parent(stage: Any, top: str, number: int, count: int) -> str:
     """The prim below which a mesh goes: the top, or a group, for what has many siblings takes long
     to add."""
     from pxr import UsdGeom
 
     if count <= SIBLINGS:
-        return f"/{name}"
-    group = f"/{name}/Group{number // SIBLINGS}"
-    if number % SIBLINGS == 0:
-        UsdGeom.Scope.Define(stage, group)
+        return top
+    group = f"{top}/Group{number // SIBLINGS}"
+    UsdGeom.Scope.Define(stage, group)
     return group
 
 
