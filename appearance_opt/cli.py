@@ -7,21 +7,17 @@ import logging
 import signal
 import sys
 import time
-from dataclasses import asdict
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
 from appearance_opt import __version__
-from appearance_opt.config import as_dict
+from appearance_opt.config import JOBS
 from appearance_opt.errors import AppearanceError, InputError
 from appearance_opt.jobs.spec import JobSpec, run
-from appearance_opt.parameters import Command, Given, job_command
-
-if TYPE_CHECKING:
-    from appearance_opt.evaluate.comparison import Comparison
-    from appearance_opt.jobs.inspect import Inspection
+from appearance_opt.parameters import Command, Given, add_command
 
 BEGAN = time.perf_counter()
 """Time budgets count from here: importing is part of a run."""
@@ -112,7 +108,6 @@ def _root(
     """Simplify 3D assets so that the result looks the same."""
 
 
-@job_command(app, "simplify")
 def simplify(
     given: Given,
     out: Out,
@@ -126,14 +121,14 @@ def simplify(
         typer.Option("--resume", help="Go on from the checkpoint.", rich_help_panel="Run"),
     ] = False,
     config: Config = None,
+    as_json: Json = False,
 ) -> None:
-    """Write an asset with fewer triangles that looks like INPUT."""
+    """Run the command of that name."""
     spec = given.spec(out, config, frozenset({"triangles", "ratio"}))
-    folder = None if no_report else report or _report_of(out)
-    _run_fit(spec, folder, checkpoint=checkpoint, resume=resume, inputs=_files(config))
+    kept = {"checkpoint": checkpoint, "resume": resume}
+    _run(spec, as_json, _folder(out, report, no_report), _files(config), **kept)
 
 
-@job_command(app, "bake")
 def bake(
     given: Given,
     out: Out,
@@ -144,27 +139,25 @@ def bake(
     report: Report = None,
     no_report: NoReport = False,
     config: Config = None,
+    as_json: Json = False,
 ) -> None:
-    """Bake what HIGH looks like into the maps of LOW, which keeps its shape."""
-    folder = None if no_report else report or _report_of(out)
-    spec = given.spec(out, config)
-    _run_fit(spec, folder, loose=loose, inputs=_files(config))
+    """Run the command of that name."""
+    folder = _folder(out, report, no_report)
+    _run(given.spec(out, config), as_json, folder, _files(config), loose=loose)
 
 
-@job_command(app, "joint")
-def joint(
+def make_asset(
     given: Given,
     out: Out,
     report: Report = None,
     no_report: NoReport = False,
     config: Config = None,
+    as_json: Json = False,
 ) -> None:
-    """Bake with LOW's shape free: fit it, a displacement, normals and material together."""
-    folder = None if no_report else report or _report_of(out)
-    _run_fit(given.spec(out, config), folder, inputs=_files(config))
+    """Run a job that makes an asset, and needs no more than all of them do."""
+    _run(given.spec(out, config), as_json, _folder(out, report, no_report), _files(config))
 
 
-@job_command(app, "compare")
 def compare(
     given: Given,
     out: Annotated[
@@ -173,15 +166,24 @@ def compare(
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Measure how different two assets look: PSNR, FLIP, silhouettes."""
-    _show_comparison(run(given.spec(out)), as_json)
+    """Run the command of that name."""
+    _run(given.spec(out), as_json)
 
 
-@job_command(app, "inspect")
 def inspect(given: Given, as_json: Json = False) -> None:
-    """Say what is in an asset, what is wrong with it, and what simplify will do with each
-    material."""
-    _show_inspection(run(given.spec()), as_json)
+    """Run the command of that name."""
+    _run(given.spec(), as_json)
+
+
+COMMANDS: dict[str, Callable[..., None]] = {
+    "simplify": simplify,
+    "bake": bake,
+    "compare": compare,
+    "inspect": inspect,
+}
+
+for _kind in JOBS:
+    add_command(app, _kind, COMMANDS.get(_kind, make_asset))
 
 
 @app.command("run", cls=Command)
@@ -193,14 +195,12 @@ def run_file(
 ) -> None:
     """Run the job that a file holds: job, inputs and out beside the options of that job."""
     spec = JobSpec.read(job)
-    if spec.kind == "inspect":
-        _show_inspection(run(spec), as_json)
-    elif spec.kind == "compare":
-        _show_comparison(run(spec), as_json)
-    elif spec.out is None:
+    if not JOBS[spec.kind].fits:
+        _run(spec, as_json)
+        return
+    if spec.out is None:
         raise InputError(f"{job}: out: must be the name of a file")
-    else:
-        _run_fit(spec, None if no_report else report or _report_of(Path(spec.out)), inputs=[job])
+    _run(spec, as_json, _folder(Path(spec.out), report, no_report), [job])
 
 
 @app.command()
@@ -218,52 +218,37 @@ def doctor(as_json: Annotated[bool, typer.Option("--json", help="Print as JSON."
         raise AppearanceError(str(found["problem"]))
 
 
-def _run_fit(spec: JobSpec, report: Path | None, **surroundings: Any) -> None:
-    """Run a job that may fit, and say what it did."""
-    from appearance_opt.progress import TerminalProgress
+def _run(
+    spec: JobSpec,
+    as_json: bool,
+    report: Path | None = None,
+    inputs: list[Path] | None = None,
+    **surroundings: Any,
+) -> None:
+    """Run a job and say what came of it."""
+    if JOBS[spec.kind].fits:
+        from appearance_opt.progress import TerminalProgress
 
-    with TerminalProgress() as progress:
-        result = run(spec, report=report, progress=progress, began=BEGAN, **surroundings)
-    for note in result.notes:
-        print(f"note: {note}", file=sys.stderr)
-    if spec.kind == "bake":
-        maps = ",".join(as_dict(spec.options)["maps"])
-        done = f"{maps}, {100 * result.missed_share:.2f} % of the texels missed"
+        with TerminalProgress() as progress:
+            surroundings |= {"report": report, "progress": progress, "began": BEGAN}
+            result = run(spec, inputs=inputs or [], **surroundings)
     else:
-        kept = f" and {result.kept_triangles} kept as they are" if result.kept_triangles else ""
-        done = f"{result.triangles} of {result.source_triangles} triangles{kept}"
-    done += f", {result.seconds['total']:.1f} s"
-    if result.fit is not None and result.fit.curve:
-        curve = [point.psnr for point in result.fit.curve]
-        done += f", held-out PSNR {curve[0]:.2f} -> {max(curve):.2f} dB"
-    print(f"{spec.out}: {done}")
+        result = run(spec)
+    if spec.kind != "inspect":  # which has notes among its lines
+        for note in result.notes:
+            print(f"note: {note}", file=sys.stderr)
+    if as_json:
+        _print_json(result.record())
+        return
+    place = f"{spec.out}: " if JOBS[spec.kind].fits else ""
+    print(place + "\n".join(result.lines()))
     if report is not None and (report / "report.html").is_file():
         print(f"report: {report / 'report.html'}")
 
 
-def _show_comparison(result: Comparison, as_json: bool) -> None:
-    for note in result.notes:
-        print(f"note: {note}", file=sys.stderr)
-    metrics = result.metrics
-    if as_json:
-        _print_json(asdict(metrics))
-        return
-    print(f"PSNR, covered pixels  {metrics.psnr_covered:7.2f} dB")
-    print(f"PSNR, whole image     {metrics.psnr:7.2f} dB")
-    print(f"FLIP                  {metrics.flip:7.4f}")
-    print(f"silhouette IoU        {metrics.silhouette_iou:7.4f}")
-    print(f"silhouette shift      {metrics.silhouette_shift:7.3f} px")
-
-
-def _show_inspection(found: Inspection, as_json: bool) -> None:
-    if as_json:
-        _print_json(found.record())
-    else:
-        print("\n".join(found.lines()))
-
-
-def _report_of(out: Path) -> Path:
-    return out.with_name(out.stem + ".report")
+def _folder(out: Path, report: Path | None, no_report: bool) -> Path | None:
+    """Where the report goes."""
+    return None if no_report else report or out.with_name(out.stem + ".report")
 
 
 def _files(config: Path | None) -> list[Path]:

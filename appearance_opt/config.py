@@ -146,14 +146,20 @@ class InspectOptions(Options):
 
 @dataclass(frozen=True)
 class Job:
-    """A kind of job: its options, what it calls its inputs, whether it writes anything, and
-    ``hints``: what to write instead of keys that are no longer there. The recipe is the function of
-    the kind's name in the module of ``jobs`` of that name."""
+    """A kind of job: ``help`` in a sentence, its options, what it calls its inputs, whether it
+    writes anything, and ``hints``: what to write instead of keys that are no longer there. The
+    recipe is the function of the kind's name in the module of ``jobs`` of that name."""
 
+    help: str
     options: type[Options]
     inputs: tuple[str, ...]
     writes: bool = True
     hints: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def fits(self) -> bool:
+        """Does it make an asset, with progress, a report and a time budget?"""
+        return issubclass(self.options, CommonOptions)
 
 
 JOINT = (
@@ -162,13 +168,34 @@ JOINT = (
 )
 
 JOBS: dict[str, Job] = {
-    "simplify": Job(SimplifyOptions, ("INPUT",)),
-    "bake": Job(BakeOptions, ("HIGH", "LOW"), hints={"joint": JOINT}),
-    "joint": Job(JointOptions, ("HIGH", "LOW")),
-    "compare": Job(CompareOptions, ("REFERENCE", "CANDIDATE")),
-    "inspect": Job(InspectOptions, ("INPUT",), writes=False),
+    "simplify": Job(
+        "Write an asset with fewer triangles that looks like INPUT.", SimplifyOptions, ("INPUT",)
+    ),
+    "bake": Job(
+        "Bake what HIGH looks like into the maps of LOW, which keeps its shape.",
+        BakeOptions,
+        ("HIGH", "LOW"),
+        hints={"joint": JOINT},
+    ),
+    "joint": Job(
+        "Bake with LOW's shape free: fit it, a displacement, normals and material together.",
+        JointOptions,
+        ("HIGH", "LOW"),
+    ),
+    "compare": Job(
+        "Measure how different two assets look: PSNR, FLIP, silhouettes.",
+        CompareOptions,
+        ("REFERENCE", "CANDIDATE"),
+    ),
+    "inspect": Job(
+        "Say what is in an asset, what is wrong with it, and what simplify will do with each "
+        "material.",
+        InspectOptions,
+        ("INPUT",),
+        writes=False,
+    ),
 }
-"""All jobs by name. A job is its record above, a line here, and a recipe."""
+"""All jobs by name: a job is its record above, an entry here, and a recipe."""
 
 OPTION_NAMES = frozenset(entries(SimplifyOptions))
 BAKE_OPTION_NAMES = frozenset(entries(BakeOptions))

@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperCommand
 
-from appearance_opt.config import JOBS, PRESETS, CommonOptions, make_options, read_toml
+from appearance_opt.config import JOBS, PRESETS, make_options, read_toml
 from appearance_opt.errors import InputError
 from appearance_opt.jobs.spec import JobSpec
 from appearance_opt.options.option import Entry, entries, flag_name
@@ -85,31 +85,26 @@ class Given:
         return JobSpec(self.kind, self.inputs, None if out is None else str(out), made)
 
 
-def job_command(app: typer.Typer, kind: str) -> Callable[[Callable], Callable]:
-    """A decorator that makes ``function(given, **others)`` the command ``kind``: with positional
-    arguments for the inputs of that job, its own parameters and an option for each of the job's."""
+def add_command(app: typer.Typer, kind: str, function: Callable[..., None]) -> None:
+    """Make ``function(given, **others)`` the command ``kind``: with positional arguments for the
+    inputs of that job, its own parameters and an option for each of the job's."""
+    job = JOBS[kind]
+    _, *own = inspect.signature(function, eval_str=True).parameters.values()
+    inputs = [_argument(name) for name in job.inputs]
+    options = [_parameter(e) for e in entries(job.options).values()]
+    if job.fits:
+        options.insert(0, _preset())
+    parameters = [p.replace(kind=p.KEYWORD_ONLY) for p in (*inputs, *own, *options)]
 
-    def register(function: Callable) -> Callable:
-        _, *own = inspect.signature(function, eval_str=True).parameters.values()
-        inputs = [_argument(name) for name in JOBS[kind].inputs]
-        options = [_parameter(e) for e in entries(JOBS[kind].options).values()]
-        if issubclass(JOBS[kind].options, CommonOptions):
-            options.insert(0, _preset())
-        parameters = [p.replace(kind=p.KEYWORD_ONLY) for p in (*inputs, *own, *options)]
+    def command(**arguments: Any) -> None:
+        paths = tuple(arguments.pop(p.name) for p in inputs)
+        values = {p.name: arguments.pop(p.name) for p in options}
+        written = {k: v for k, v in values.items() if v is not None and v != []}
+        function(Given(kind, paths, written), **arguments)
 
-        def command(**arguments: Any) -> None:
-            paths = tuple(arguments.pop(p.name) for p in inputs)
-            values = {p.name: arguments.pop(p.name) for p in options}
-            written = {k: v for k, v in values.items() if v is not None and v != []}
-            function(Given(kind, paths, written), **arguments)
-
-        command.__doc__ = function.__doc__
-        command.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
-        command.__annotations__ = {p.name: p.annotation for p in parameters}
-        app.command(kind, cls=Command)(command)
-        return function
-
-    return register
+    command.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    command.__annotations__ = {p.name: p.annotation for p in parameters}
+    app.command(kind, cls=Command, help=job.help)(command)
 
 
 def _argument(name: str) -> inspect.Parameter:

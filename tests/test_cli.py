@@ -111,6 +111,10 @@ def test_simplify_and_compare_as_a_user_would(ball: Asset, tmp_path: Path) -> No
             "--checkpoint",
         ),
         (["compare", "ball.glb", "empty.glb"], "empty"),
+        (
+            ["bake", "ball.glb", "ball.glb", "--joint", "--subdivision", "2", "--out", "x.glb"],
+            "write appearance-opt joint HIGH LOW --out OUT",
+        ),
         (["nonsense"], "nonsense"),
     ],
 )

@@ -80,6 +80,8 @@ def test_a_job_is_run_as_by_its_function(ball: Asset, tmp_path: Path) -> None:
     result = run(JobSpec("simplify", (ball,), str(tmp_path / "low.glb"), options))
     direct = appearance_opt.simplify(ball, None, preset="draft", **quick)
     assert result.triangles == direct.triangles
+    assert json.loads(json.dumps(result.record()))["held_out_psnr"][1] > 20
+    assert result.lines()[0].startswith(f"{result.triangles} of 2208 triangles, ")
     assert load(tmp_path / "low.glb").triangle_count == result.triangles
 
 

@@ -3,8 +3,8 @@ difference."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any
 
 from appearance_opt.errors import InputError
 from appearance_opt.evaluate.metrics import compare_images
@@ -30,6 +30,21 @@ class Comparison:
     reference: NDArray[np.float32]
     candidate: NDArray[np.float32]
     notes: tuple[str, ...] = ()
+
+    def lines(self) -> list[str]:
+        """The metrics for a terminal."""
+        m = self.metrics
+        return [
+            f"PSNR, covered pixels  {m.psnr_covered:7.2f} dB",
+            f"PSNR, whole image     {m.psnr:7.2f} dB",
+            f"FLIP                  {m.flip:7.4f}",
+            f"silhouette IoU        {m.silhouette_iou:7.4f}",
+            f"silhouette shift      {m.silhouette_shift:7.3f} px",
+        ]
+
+    def record(self) -> dict[str, Any]:
+        """The metrics for JSON."""
+        return asdict(self.metrics)
 
 
 def compare_local(

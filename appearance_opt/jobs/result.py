@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -47,6 +47,29 @@ class Result:
     def start(self) -> Asset:
         """The same before the fit."""
         return next(iter(self.columns.values()))
+
+    def outcome(self) -> str:
+        """What came of it, in a few words."""
+        return self.title
+
+    def lines(self) -> list[str]:
+        """What a terminal shows of it."""
+        line = f"{self.outcome()}, {self.seconds['total']:.1f} s"
+        if self.fit is not None and self.fit.curve:
+            psnr = [point.psnr for point in self.fit.curve]
+            line += f", held-out PSNR {psnr[0]:.2f} -> {max(psnr):.2f} dB"
+        return [line]
+
+    def record(self) -> dict[str, Any]:
+        """Numbers of it for JSON; PSNR in dB, before the fit and of the best state."""
+        psnr = [] if self.fit is None else [point.psnr for point in self.fit.curve]
+        return {
+            **self.facts,
+            "held_out_psnr": [psnr[0], max(psnr)] if psnr else None,
+            "steps": 0 if self.fit is None else self.fit.steps,
+            "seconds": self.seconds,
+            "notes": self.notes,
+        }
 
     @property
     def shown(self) -> Asset:
@@ -99,6 +122,11 @@ class SimplifyResult(Result):
             tessellated=levels,
         )
 
+    def outcome(self) -> str:
+        """Triangles before and after."""
+        kept = f" and {self.kept_triangles} kept as they are" if self.kept_triangles else ""
+        return f"{self.facts['triangles']} triangles{kept}"
+
 
 @dataclass
 class BakeResult(Result):
@@ -110,6 +138,10 @@ class BakeResult(Result):
     covered: NDArray[np.bool_] = field(kw_only=True)
     missed: NDArray[np.bool_] = field(kw_only=True)
     reach: float = field(kw_only=True)
+
+    def outcome(self) -> str:
+        """How much of LOW found nothing of HIGH."""
+        return f"{100 * self.missed_share:.2f} % of the texels missed"
 
     @property
     def closed_form(self) -> Asset:
