@@ -24,6 +24,7 @@ from appearance_opt.options.option import (
     option,
     part,
     require,
+    spelling,
 )
 from appearance_opt.options.reading import AssetOptions
 from appearance_opt.options.start import StartOptions
@@ -197,9 +198,6 @@ JOBS: dict[str, Job] = {
 }
 """All jobs by name: a job is its record above, an entry here, and a recipe."""
 
-OPTION_NAMES = frozenset(entries(SimplifyOptions))
-BAKE_OPTION_NAMES = frozenset(entries(BakeOptions))
-
 
 def simplify_options(preset: str = "default", **values: Any) -> SimplifyOptions:
     """Options from a preset and what overrides it. Raises InputError for unknown names and bad
@@ -247,19 +245,26 @@ def resolve_options(kind: type[T], options: T | None, values: Mapping[str, Any])
 def read_toml(path: Path, kind: type[Options] = SimplifyOptions) -> dict[str, Any]:
     """Flat keys of a file of options. Raises InputError for unknown keys, suggesting the
     nearest."""
-    values = read_table(path)
-    check_keys(path, values, kind)
-    return values
+    return flat_keys(path, read_table(path), kind)
 
 
-def check_keys(
-    path: Path, values: Iterable[str], kind: type[Options], others: tuple[str, ...] = ()
-) -> None:
-    """Raise InputError for keys of a file that are no options of ``kind``, nor ``others``."""
-    known = {*entries(kind), "preset", *others}
-    for key in values:
+def flat_keys(
+    path: Path, values: Mapping[str, Any], kind: type[Options], others: tuple[str, ...] = ()
+) -> dict[str, Any]:
+    """What a file holds under the keys of ``kind``, where it has the command line's spelling, too.
+    Raises InputError for keys that are no options of ``kind``, nor ``others``."""
+    options = entries(kind)
+    known = {*options, "preset", *others}
+    spelt = {spelling(e.spec, key): key for key, e in options.items()}
+    out = {}
+    for key, value in values.items():
+        key = key if key in known else spelt.get(key, key)
         if key not in known:
             raise InputError(f"{path}: {_unknown(key, kind, known)}")
+        if key in out:
+            raise InputError(f"{path}: '{key}' is given twice")
+        out[key] = value
+    return out
 
 
 def read_table(path: Path) -> dict[str, Any]:

@@ -131,6 +131,16 @@ def test_files_of_options_may_be_json(tmp_path: Path) -> None:
             read_toml(tmp_path / "b.json")
 
 
+def test_a_file_may_spell_a_key_as_the_command_line_does(tmp_path: Path) -> None:
+    (tmp_path / "a.toml").write_text('for = "web"\n')
+    assert read_toml(tmp_path / "a.toml") == {"target": "web"}
+    (tmp_path / "a.toml").write_text('for = "web"\ntarget = "game"\n')
+    with pytest.raises(InputError, match="'target' is given twice"):
+        read_toml(tmp_path / "a.toml")
+    with pytest.raises(InputError, match="--for 3: expected"):
+        simplify_options(triangles=9, target=3)
+
+
 @pytest.mark.parametrize("value", ["=x", "", "look=", 3, ["a", 3]])
 def test_variants_that_name_nothing_are_refused(value: object) -> None:
     with pytest.raises(InputError, match="--variant"):

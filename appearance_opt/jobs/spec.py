@@ -9,7 +9,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from appearance_opt.config import JOBS, as_dict, check_keys, make_options, read_table
+from appearance_opt.config import JOBS, as_dict, flat_keys, make_options, read_table
 from appearance_opt.errors import InputError
 from appearance_opt.options.option import Record, check_choice
 
@@ -77,7 +77,7 @@ class JobSpec:
         values = read_table(path)
         kind = values.get("job")
         if isinstance(kind, str) and kind in JOBS:
-            check_keys(path, values, JOBS[kind].options, _OWN)
+            values = flat_keys(path, values, JOBS[kind].options, _OWN)
         try:
             return cls.from_dict(values)
         except InputError as error:

@@ -90,7 +90,9 @@ class Record:
     def __post_init__(self) -> None:
         for f in fields(self):
             if "option" in f.metadata:
-                f.metadata["option"].check(spelling(f), getattr(self, f.name))
+                f.metadata["option"].check(
+                    spelling(f.metadata["option"], key_of(f)), getattr(self, f.name)
+                )
 
 
 @dataclass(frozen=True)
@@ -141,7 +143,7 @@ class Entry:
             return None
         if self.spec.parse is not None:
             return self.spec.parse(value)
-        name = flag_name(self.key)
+        name = spelling(self.spec, self.key)
         if isinstance(value, float) and not math.isfinite(value):
             raise InputError(f"--{name} {value}: is not a number")
         allowed = tuple(t for word, types in _TYPES.items() if word in self.kind for t in types)
@@ -178,10 +180,9 @@ def key_of(f: Field) -> str:
     return f.name if spec is None or not spec.key else spec.key
 
 
-def spelling(f: Field) -> str:
-    """What the command line calls a field, without dashes before it."""
-    spec: Spec = f.metadata["option"]
-    return spec.flag.split("/")[0].lstrip("-") or flag_name(key_of(f))
+def spelling(spec: Spec, key: str) -> str:
+    """What the command line calls an option, without dashes before it."""
+    return spec.flag.split("/")[0].lstrip("-") or flag_name(key)
 
 
 def flag_name(key: str) -> str:
