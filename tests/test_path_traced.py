@@ -9,6 +9,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+import appearance_opt
 from appearance_opt import backend
 from appearance_opt.asset.types import Asset, Material, Mesh, Texture
 from appearance_opt.errors import BackendError
@@ -106,6 +107,36 @@ def test_the_environment_looks_alike_in_both_renderers() -> None:
     inside = (ours[..., 3] > 0.99) & (theirs[..., 3] > 0.99)
     off = np.abs(ours - theirs)[inside].mean() / theirs[inside][:, :3].mean()
     assert off < 0.2  # measured 0.13: diffuse light is not the same model
+
+
+@pytest.mark.parametrize(
+    ("renderer", "light"), [("own", "environment"), ("path", "point"), ("path", "environment")]
+)
+def test_comparisons_under_other_lights_and_by_another_renderer(
+    renderer: str, light: str, capfd: pytest.CaptureFixture
+) -> None:
+    """What is alike is alike in each of them, and what is darker is not; samples that are no
+    square bring no warning."""
+    ball = make_asset()
+    dark = replace(ball.meshes[0].material, base_color=(0.5, 0.5, 0.5))
+    other = replace(ball, meshes=(replace(ball.meshes[0], material=dark),))
+    given = {"views": 2, "resolution": 48, "samples": 7, "renderer": renderer, "light": light}
+    same = appearance_opt.compare(ball, ball, **given)
+    assert same.metrics.psnr == 99.0 and same.metrics.noticed == 0.0
+    unlike = appearance_opt.compare(ball, other, **given)
+    assert unlike.metrics.psnr_covered < 25 and unlike.metrics.noticed > 0.5
+    assert "WARN" not in "".join(capfd.readouterr())
+    usual = appearance_opt.compare(ball, other, views=2, resolution=48, samples=7)
+    assert np.abs(usual.reference - unlike.reference).max() > 0.05
+
+
+def test_what_the_path_tracer_leaves_out_is_said() -> None:
+    mesh = make_asset(8, 16).meshes[0]
+    painted = replace(mesh, colors=np.full((len(mesh.positions), 3), 0.5, np.float32))
+    given = {"views": 1, "resolution": 32, "samples": 1}
+    found = appearance_opt.compare(Asset((painted,)), Asset((painted,)), renderer="path", **given)
+    assert any("leaves out vertex colours" in note for note in found.notes)
+    assert not appearance_opt.compare(Asset((painted,)), Asset((painted,)), **given).notes
 
 
 def test_an_old_compiler_is_refused_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -20,9 +20,11 @@ from appearance_opt.evaluate.hero import hero_view
 from appearance_opt.evaluate.metrics import compare_images, halve
 from appearance_opt.evaluate.pictures import encode_for_page, shrink
 from appearance_opt.evaluate.report import Option, ReportData, page, verdict
+from appearance_opt.evaluate.showing import Looks, show
 from appearance_opt.evaluate.sizes import in_bytes, sizes_of
 from appearance_opt.evaluate.verdict import AtSize, at_sizes, describe_visibility, percent
-from appearance_opt.views import support
+from appearance_opt.reference.mesh import MeshReference
+from appearance_opt.views import Views, support, views_around
 from tests.conftest import make_asset
 
 VOID = {"meta", "img", "input", "br", "link"}
@@ -242,6 +244,40 @@ def test_the_view_is_upright_and_shows_most() -> None:
     assert abs(view.right[0][1]) < 1e-3 * np.linalg.norm(view.right[0])
     same = hero_view(points, lambda v: np.zeros((len(v), 16, 16, 4), np.float32))
     assert same.eye[0][2] > 0  # nothing to choose by: the front
+
+
+class Box:
+    """A reference that is nothing but images."""
+
+    def __init__(self, asset: Asset) -> None:
+        self._inner = MeshReference(asset)
+        self.bounds = self._inner.bounds
+
+    def render(self, views: Views, resolution: int, samples: int = 16) -> np.ndarray:
+        return self._inner.render(views, resolution, samples)
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_what_is_shown_of_assets_and_of_images_alone(ball: Asset, known: bool) -> None:
+    low = make_asset(8, 16)
+    sampler = views_around(ball.points(), 0)
+    looks = Looks(views=2, resolution=96, samples=4, pictured=64)
+    reference = MeshReference(ball) if known else Box(ball)
+    columns = {"start": make_asset(4, 8), "result": low}
+    shown = show(reference, ball if known else None, columns, low, sampler, looks)
+    assert shown.metrics["result"].psnr > shown.metrics["start"].psnr
+    assert [s.pixels for s in shown.by_size] == [96, 48]
+    assert shown.by_size[0].noticed == shown.metrics["result"].noticed
+    hero, worst = shown.views
+    assert hero["reference"].shape == hero["wireframe"].shape == (64, 64, 3)
+    assert worst["result"].shape == (96, 96, 3)
+    assert set(shown.previews) == ({"original", "result"} if known else {"result"})
+    assert ("lamp" in shown.captions[0]) and (("sky" in shown.captions[0]) == known)
+    # as bright in the middle, where both show the ball
+    middle = [hero[n][24:40, 24:40].mean() for n in ("reference", "result")]
+    assert middle[0] == pytest.approx(middle[1], rel=0.1)
+    text = page(ReportData("", {}, **vars(shown)))
+    assert ("value='both'" in text) == known
 
 
 def test_pictures_shrink_by_averages_and_stay_what_they_are() -> None:

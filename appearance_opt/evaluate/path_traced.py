@@ -7,6 +7,7 @@ interreflection are there, and light is judged by geometry as path tracers judge
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -72,7 +73,10 @@ class PathTraced:
         self.scene = mi.load_dict(scene)
 
     def render(self, views: Views, resolution: int, samples: int = 64) -> NDArray[np.float32]:
-        """Images (B, resolution, resolution, 4). Noise is the same in every run."""
+        """Images (B, resolution, resolution, 4). Noise is the same in every run. ``samples``: at
+        least so many, as they lie on a grid in the pixel."""
+        columns = math.isqrt(samples)
+        samples = columns * -(-samples // columns)
         images = []
         for k in range(len(views)):
             if not self.environment:

@@ -131,8 +131,8 @@ def page(data: ReportData) -> str:
         "sizes": _sizes(data.sizes),
         "maps": _maps(data.maps),
         "curve": _section(
-            "How the error fell",
-            "PSNR over whole images of views that the fit does not see, against time.",
+            "The fit",
+            "PSNR (dB) over whole images of views that the fit does not see, against time.",
             curve_svg(data.curve),
         )
         if len(data.curve) > 1
