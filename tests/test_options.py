@@ -141,6 +141,12 @@ def test_a_file_may_spell_a_key_as_the_command_line_does(tmp_path: Path) -> None
         simplify_options(triangles=9, target=3)
 
 
+def test_variants_may_be_a_dictionary() -> None:
+    made = simplify_options(triangles=9, variant={"look": "worn", "": "blue"})
+    assert made.asset.variant == ("look=worn", "blue")
+    assert made.asset.arguments()["variants"] == {"look": "worn", "": "blue"}
+
+
 @pytest.mark.parametrize("value", ["=x", "", "look=", 3, ["a", 3]])
 def test_variants_that_name_nothing_are_refused(value: object) -> None:
     with pytest.raises(InputError, match="--variant"):

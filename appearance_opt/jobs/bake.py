@@ -44,7 +44,6 @@ def bake(
     report: str | Path | None = None,
     loose: str | Path | None = None,
     progress: Progress | None = None,
-    variants: dict[str, str] | None = None,
     began: float | None = None,
     inputs: Iterable[str | Path] = (),
     **values: Any,
@@ -61,7 +60,7 @@ def bake(
     options = resolve_options(BakeOptions, options, values)
     outputs = Outputs.of(out, options, report=report, loose=loose)
     with open_run(outputs, (high, low, *inputs), options, progress, began) as run:
-        pair = read_pair(high, low, outputs, options, variants, run)
+        pair = read_pair(high, low, outputs, options, run)
         result = _bake(pair, options, run)
         beside = partial(_write_loose, result, options, outputs.loose)
         close_run(run, result, outputs, options, pair.shown, beside)

@@ -26,19 +26,18 @@ def compare(
     options: CompareOptions | None = None,
     *,
     out: str | Path | None = None,
-    variants: dict[str, str] | None = None,
     **values: Any,
 ) -> Comparison:
     """Render both assets from random cameras under random lights and measure the difference.
-    ``values``: options by flat key, instead of ``options`` or over them: ``views=4``. ``out``:
-    folder for a report with pictures. ``variants``: of the reference. What is transparent is drawn
-    so (see ``render.layers``). Raises AppearanceError, also if one of the two shows nothing."""
+    ``values``: options by flat key, instead of ``options`` or over them: ``views=4``. ``variant`` is
+    of the reference. ``out``: folder for a report with pictures. What is transparent is drawn so (see
+    ``render.layers``). Raises AppearanceError, also if one of the two shows nothing."""
     options = resolve_options(CompareOptions, options, values)
     outputs = Outputs.of(None, report=out)
     outputs.check()
     outputs.check_sources(reference, candidate)
     with outputs.held():
-        return _compare(reference, candidate, options, outputs, variants)
+        return _compare(reference, candidate, options, outputs)
 
 
 def _compare(
@@ -46,15 +45,14 @@ def _compare(
     candidate: str | Path | Asset,
     options: CompareOptions,
     outputs: Outputs,
-    variants: dict[str, str] | None,
 ) -> Comparison:
     from appearance_opt.asset import load
     from appearance_opt.asset.types import Asset
 
     reading = options.asset.arguments()
     first, second = (
-        asset if isinstance(asset, Asset) else load(asset, **{**reading, "variants": chosen})
-        for asset, chosen in ((reference, variants or reading["variants"]), (candidate, None))
+        asset if isinstance(asset, Asset) else load(asset, **arguments)
+        for asset, arguments in ((reference, reading), (candidate, {**reading, "variants": None}))
     )
     outputs.check_inputs(first, second)
     outputs.check_room(0, None)

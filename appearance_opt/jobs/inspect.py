@@ -198,14 +198,12 @@ class Inspection:
 def inspect(
     source: str | Path,
     options: InspectOptions | None = None,
-    *,
-    variants: dict[str, str] | None = None,
     **values: Any,
 ) -> Inspection:
     """What is in a file, and what is wrong with it. ``values``: options by flat key, as those of
     ``load``. Raises InputError."""
-    reading = resolve_options(InspectOptions, options, values).asset.arguments()
-    read = partial(load, source, **{**reading, "variants": variants or reading["variants"]})
+    options = resolve_options(InspectOptions, options, values)
+    read = partial(load, source, **options.asset.arguments())
     given = read(mend=False)
     counts, asset = repair_and_count(given, str(source))
     low, high = asset.bounds()

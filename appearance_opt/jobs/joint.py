@@ -36,7 +36,6 @@ def joint(
     *,
     report: str | Path | None = None,
     progress: Progress | None = None,
-    variants: dict[str, str] | None = None,
     began: float | None = None,
     inputs: Iterable[str | Path] = (),
     **values: Any,
@@ -49,7 +48,7 @@ def joint(
     options = resolve_options(JointOptions, options, values)
     outputs = Outputs.of(out, options, report=report)
     with open_run(outputs, (high, low, *inputs), options, progress, began) as run:
-        pair = read_pair(high, low, outputs, options, variants, run)
+        pair = read_pair(high, low, outputs, options, run)
         result = _fit(pair, options, run)
         beside = partial(write_levels, result, options)
         close_run(run, result, outputs, options, pair.shown, beside)

@@ -49,14 +49,11 @@ def open_run(
         yield run
 
 
-def load_source(
-    source: str | Path | Asset, options: CommonOptions, variants: dict[str, str] | None = None
-) -> Asset:
+def load_source(source: str | Path | Asset, options: CommonOptions) -> Asset:
     """``source`` itself, or the file of that name, read as the options say."""
     if not isinstance(source, (str, Path)):
         return source
-    arguments = options.asset.arguments()
-    return load(source, **{**arguments, "variants": variants or arguments["variants"]})
+    return load(source, **options.asset.arguments())
 
 
 def load_layout(source: str | Path | Asset, options: CommonOptions, missing_textures: str) -> Asset:
@@ -83,13 +80,12 @@ def read_pair(
     low: str | Path | Asset,
     outputs: Outputs,
     options: BakeOptions | JointOptions,
-    variants: dict[str, str] | None,
     run: Run,
 ) -> Pair:
     """What of HIGH is baked, and what of LOW it is baked onto. Raises InputError if it is nothing,
     or if the outputs would replace a file of either."""
     run.begin("reading both meshes")
-    heavy = load_source(high, options, variants)
+    heavy = load_source(high, options)
     light = load_layout(low, options, options.asset.missing_textures)
     outputs.check_inputs(heavy, light)
     outputs.check_room(light.triangle_count, options)

@@ -49,7 +49,6 @@ def simplify(
     checkpoint: str | Path | None = None,
     resume: bool = False,
     progress: Progress | None = None,
-    variants: dict[str, str] | None = None,
     began: float | None = None,
     inputs: Iterable[str | Path] = (),
     **values: Any,
@@ -59,12 +58,12 @@ def simplify(
 
     ``values``: options by flat key, instead of ``options`` or over them: ``triangles=3000``.
     ``report``: folder for pictures, metrics and report.html. ``checkpoint``: folder in which the
-    state is kept every few seconds; with ``resume`` a run goes on from there. ``variants``: USD
-    variant selections. ``began``: ``time.perf_counter()`` at which the time budget began, if before
-    this call. ``inputs``: other files that must not be replaced. Transparent meshes of the source
-    pass into the result as they are (see ``stages.parts``). Ctrl-C ends the fit early and still
-    writes the best state so far, the third one gives it up; once the result is written it ends the
-    report. Raises AppearanceError.
+    state is kept every few seconds; with ``resume`` a run goes on from there. ``began``:
+    ``time.perf_counter()`` at which the time budget began, if before this call. ``inputs``: other
+    files that must not be replaced. Transparent meshes of the source pass into the result as they
+    are (see ``stages.parts``). Ctrl-C ends the fit early and still writes the best state so far,
+    the third one gives it up; once the result is written it ends the report. Raises
+    AppearanceError.
     """
     options = resolve_options(SimplifyOptions, options, values)
     outputs = Outputs.of(out, options, report=report, checkpoint=checkpoint)
@@ -74,7 +73,7 @@ def simplify(
             raise InputError("--resume needs --checkpoint DIR")
         is_file = isinstance(source, (str, Path))
         run.begin(f"reading {Path(str(source)).name}" if is_file else "checking the asset")
-        asset, given = load_source(source, options, variants), options.start.file
+        asset, given = load_source(source, options), options.start.file
         first = None if given is None else load_layout(given, options, "ignore")
         outputs.check_inputs(asset, first)
         expected = round((options.start.ratio or 1.0) * asset.triangle_count)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from os import PathLike, fspath
 from typing import Any
@@ -20,6 +21,8 @@ def _folder(value: Any) -> str:
 
 def _variants(value: Any) -> tuple[str, ...]:
     given = [value] if isinstance(value, str) else value
+    if isinstance(value, Mapping):
+        given = [f"{name}={choice}" if name else choice for name, choice in value.items()]
     if not isinstance(given, (list, tuple)) or not all(isinstance(v, str) for v in given):
         raise InputError(f"--variant {value!r}: write set=name for USD, a name for glTF")
     for text in given:
