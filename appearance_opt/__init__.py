@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from appearance_opt.evaluate.comparison import Comparison
     from appearance_opt.jobs.bake import bake
     from appearance_opt.jobs.compare import compare
+    from appearance_opt.jobs.fit import fit
     from appearance_opt.jobs.inspect import Inspection, inspect
     from appearance_opt.jobs.joint import joint
     from appearance_opt.jobs.result import BakeResult, Result, SimplifyResult
@@ -70,6 +71,7 @@ _HOMES = {
     "bake": "appearance_opt.jobs.bake",
     "bake_options": "appearance_opt.config",
     "compare": "appearance_opt.jobs.compare",
+    "fit": "appearance_opt.jobs.fit",
     "inspect": "appearance_opt.jobs.inspect",
     "joint": "appearance_opt.jobs.joint",
     "joint_options": "appearance_opt.config",
@@ -109,6 +111,7 @@ __all__ = [
     "bake",
     "bake_options",
     "compare",
+    "fit",
     "inspect",
     "joint",
     "joint_options",

@@ -25,14 +25,14 @@ def choose_start(
     """(start, options of the fit that follows). ``given``: the mesh that ``options.start.init``
     names, None if it names none. A shape that is far from its goal is fitted first, in a part of
     the time or the steps."""
-    survey, o = require_survey(subject), options
-    available = len(survey.triangles.faces)
+    o, survey = options, subject.survey
+    available = None if survey is None else len(survey.triangles.faces)
     alone = "shape" in o.fit.parts and not o.displacement.fitted
     if given is not None and o.fit.relative is False and alone:
         start, o = _fit_shape(lambda effort: mend_start(subject, options, given, effort), o, run)
         o = with_values(o, relative=None)  # the mended shape is a likeness
     elif given is not None:
-        start = _make(lambda: transfer_appearance(survey, given, options), run)
+        start = _make(lambda: transfer_appearance(require_survey(subject), given, options), run)
     elif o.start.init == "sphere" and alone:
         count = budget(o, available)
         start, o = _fit_shape(lambda effort: grow_start(subject, options, count, effort), o, run)
@@ -42,7 +42,7 @@ def choose_start(
     else:
         count, left = budget(o, available), run.seconds_left()
         start = _make(lambda: decimate_start(subject, options, count, left, run.begin), run)
-    return inherit_sides(start, survey.triangles.single), o
+    return (start if survey is None else inherit_sides(start, survey.triangles.single)), o
 
 
 def _make(make: Callable[[], Start], run: Run) -> Start:

@@ -62,14 +62,19 @@ class Start:
         return self.mesh if self.finest is None else self.finest
 
 
-def budget(options: SimplifyOptions, available: int) -> int:
-    """Triangles asked for. Raises InputError when the input has fewer, or when their tessellation
-    does not fit into memory."""
+def budget(options: SimplifyOptions, available: int | None) -> int:
+    """Triangles asked for. Raises InputError when the input has fewer (None: it has none to be
+    counted), or when their tessellation does not fit into memory."""
     count = options.start.triangles
-    if count is None:
+    if available is None:
+        if count is None:
+            raise InputError(
+                "--ratio: the reference has no triangles to be counted; give --triangles"
+            )
+    elif count is None:
         assert options.start.ratio is not None
         count = min(max(4, round(options.start.ratio * available)), available)
-    if count > available:
+    elif count > available:
         raise InputError(
             f"--triangles {count}: the input has only {available} triangles; ask for fewer"
         )
