@@ -5,12 +5,12 @@ from __future__ import annotations
 import sys
 import threading
 import time
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 if TYPE_CHECKING:
     from types import TracebackType
 
-    from rich.progress import Progress
+    from rich.progress import Progress as Bar
 
 
 EVERY = 5.0
@@ -18,26 +18,44 @@ EVERY = 5.0
 sooner, or refused, prints none."""
 
 
+class Progress(Protocol):
+    """Told of what a job does: ``stage`` when it begins with something that may take long, in a few
+    words, and ``update`` after every step of a fit and every look at the held-out views."""
+
+    def stage(self, text: str) -> None: ...
+
+    def update(
+        self,
+        step: int,
+        fraction: float,
+        loss: float,
+        psnr: float,
+        steps_per_second: float,
+        seconds_left: float | None,
+    ) -> None: ...
+
+
 class TerminalProgress:
     """Shows what is being done, and during a fit step, loss, held-out PSNR, steps per second and
     time left. A context manager."""
 
     def __init__(self) -> None:
-        self._bar: Progress | None = None
+        self._bar: Bar | None = None
         self._last = time.monotonic()
         self._next: threading.Timer | None = None
 
     def __enter__(self) -> TerminalProgress:
         if sys.stderr.isatty():
             from rich.console import Console
-            from rich.progress import BarColumn, Progress, TextColumn
+            from rich.progress import BarColumn, TextColumn
+            from rich.progress import Progress as Bar
 
             columns = (
                 TextColumn("{task.description}"),
                 BarColumn(),
                 TextColumn("{task.fields[info]}"),
             )
-            self._bar = Progress(*columns, console=Console(stderr=True), transient=True)
+            self._bar = Bar(*columns, console=Console(stderr=True), transient=True)
             self._bar.start()
             self._task = self._bar.add_task("preparing", total=1.0, info="")
         return self
@@ -53,7 +71,7 @@ class TerminalProgress:
             self._bar.stop()
 
     def stage(self, text: str) -> None:
-        """See ``optimize.loop.Progress``."""
+        """See ``Progress``."""
         if self._bar is not None:
             self._bar.update(self._task, description=text, info="")
             return
@@ -75,7 +93,7 @@ class TerminalProgress:
         steps_per_second: float,
         seconds_left: float | None,
     ) -> None:
-        """See ``optimize.loop.Progress``."""
+        """See ``Progress``."""
         left = "" if seconds_left is None else f"  {seconds_left:.0f} s left"
         info = f"step {step}  loss {loss:.5f}  held-out {psnr:.2f} dB  {steps_per_second:.1f} steps/s{left}"
         if self._bar is not None:

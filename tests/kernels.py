@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import drjit as dr
 
-from appearance_opt.optimize.loop import _Run
+from appearance_opt.optimize.loop import FitRun
 
 BLOCK, MOST = 8, 15
 FIRST, LATER, CHANCE = 16, 47, 6
@@ -18,7 +18,7 @@ class Kernels:
     """Those that a fit has launched so far, by the hash of their code. (Whether one was compiled
     says less: that of an earlier process comes from Dr.Jit's cache on disk.)"""
 
-    def __init__(self, run: _Run) -> None:
+    def __init__(self, run: FitRun) -> None:
         self.run = run
         self.seen: set = set()
 
@@ -36,7 +36,7 @@ class Kernels:
         return len(new)
 
 
-def settles(run: _Run) -> bool:
+def settles(run: FitRun) -> bool:
     """Does a fit come to need nothing new? True once ``BLOCK`` steps in a row launched no new
     kernel: what changes in every step, or at every change of level, never gets there. It says
     nothing of what happens less often."""
@@ -44,7 +44,7 @@ def settles(run: _Run) -> bool:
     return any(kernels.new(BLOCK) == 0 for _ in range(MOST))
 
 
-def looks_settle(run: _Run, steps: int) -> bool:
+def looks_settle(run: FitRun, steps: int) -> bool:
     """The same of a fit with a look in every ``steps`` steps: after ``FIRST`` looks, at most
     ``CHANCE`` of ``LATER`` bring new kernels. Measured: up to seven kernels after 16 steps, three
     after 64. What changes at every look, or at every fourth, brings more."""

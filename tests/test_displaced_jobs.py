@@ -28,8 +28,8 @@ from appearance_opt.latent.parameter import Rates
 from appearance_opt.latent.positions import POSITIONS
 from appearance_opt.latent.subdivision import tessellate
 from appearance_opt.latent.texels import TEXELS, TexelCodec
-from appearance_opt.optimize import loop
-from appearance_opt.optimize.loop import FitOptions, pose_of
+from appearance_opt.optimize.loop import FitRun
+from appearance_opt.optimize.plan import FitOptions, pose_of
 from appearance_opt.optimize.validation import Validation
 from appearance_opt.reference.mesh import MeshReference
 from appearance_opt.reference.pool import ReferencePool
@@ -250,9 +250,7 @@ def test_changing_levels_compiles_nothing_after_the_first_steps(bumpy: Asset) ->
     model = latent_of(mesh, maps, frozenset({"shape", "material", DISPLACEMENT}), Rates(), (1, 2))
     validation = Validation(reference, sampler.held_out(1).draw(0, 2), 32)
     fit_options = FitOptions(steps=1000)
-    run = loop._Run(
-        model, ReferencePool(reference, sampler, 8, 2, 32, 4), validation, fit_options, None, None
-    )
+    run = FitRun(model, ReferencePool(reference, sampler, 8, 2, 32, 4), validation, fit_options)
     assert settles(run)
     levels = {
         pose_of(model.poses, fit_options.seed, run.state.iteration - k).level

@@ -23,9 +23,11 @@ from appearance_opt.latent.parameter import Rates
 from appearance_opt.latent.positions import POSITIONS
 from appearance_opt.latent.texels import TEXELS, Texels
 from appearance_opt.optimize import loop
-from appearance_opt.optimize.checkpoint import Checkpointer, FitState
-from appearance_opt.optimize.loop import FitOptions, fit
+from appearance_opt.optimize.checkpoint import Checkpointer
+from appearance_opt.optimize.loop import FitRun, fit
+from appearance_opt.optimize.plan import FitOptions
 from appearance_opt.optimize.schedule import laplacian_weight
+from appearance_opt.optimize.state import FitState
 from appearance_opt.optimize.step import Gradients, StepInputs
 from appearance_opt.optimize.validation import Validation
 from appearance_opt.reference.mesh import MeshReference
@@ -101,10 +103,10 @@ def test_no_kernel_is_compiled_after_the_first_steps(ball: Asset, visibility: st
     chosen = FitOptions(
         steps=4 * looks, quality=Quality(visibility=visibility), validate_every=1 / looks
     )
-    run = loop._Run(model, pool, validation, chosen, None, None)
+    run = FitRun(model, pool, validation, chosen)
     run.look()
     assert looks_settle(run, 4)
-    assert len(run.result.curve) == looks
+    assert len(run.state.curve) == looks
 
 
 def test_a_start_is_never_made_worse(ball: Asset) -> None:
@@ -122,25 +124,25 @@ def test_resuming_goes_on_where_it_stopped(ball: Asset, tmp_path: Path, one_thre
     fit(whole, pool, validation, o)
     first, pool, validation = make_fit(ball)
     # interrupted at step 5
-    run = loop._Run(first, pool, validation, o, None, Checkpointer(tmp_path, "x", False, 0.0))
+    run = FitRun(first, pool, validation, o, [Checkpointer(tmp_path, "x", False, 0.0)])
     run.look()
     for _ in range(5):
         run.advance()
     second, pool, validation = make_fit(ball)
-    result = fit(second, pool, validation, o, None, Checkpointer(tmp_path, "x", True, 1e9))
+    result = fit(second, pool, validation, o, [Checkpointer(tmp_path, "x", True, 1e9)])
     assert result.steps == 12
     np.testing.assert_allclose(
         second.host_positions(), whole.host_positions(), rtol=0, atol=one_thread
     )
     with pytest.raises(InputError, match="another input or other options"):
-        fit(second, pool, validation, o, None, Checkpointer(tmp_path, "y", True, 1e9))
+        fit(second, pool, validation, o, [Checkpointer(tmp_path, "y", True, 1e9)])
 
 
 def test_broken_checkpoints_are_refused(ball: Asset, tmp_path: Path) -> None:
     model, pool, validation = make_fit(ball)
     (tmp_path / "fit.npz").write_bytes(b"PK rubbish")
     with pytest.raises(InputError, match="not a usable checkpoint"):
-        fit(model, pool, validation, FitOptions(steps=1), None, Checkpointer(tmp_path, "x", True))
+        fit(model, pool, validation, FitOptions(steps=1), [Checkpointer(tmp_path, "x", True)])
 
 
 def test_a_diverged_job_writes_its_best_state_first(
@@ -224,9 +226,7 @@ def test_an_interrupted_look_leaves_the_parameters(
         return whole(self, model)
 
     monkeypatch.setattr(Validation, "psnr", psnr)
-    result = fit(
-        model, pool, validation, FitOptions(steps=8, validate_every=0.5), checkpointer=Keep()
-    )
+    result = fit(model, pool, validation, FitOptions(steps=8, validate_every=0.5), [Keep()])
     assert result.interrupted and result.steps == 4
     value, mean = kept[-1][TEXELS]
     assert np.abs(value - mean).max() > 1e-4

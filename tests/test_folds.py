@@ -11,7 +11,8 @@ from appearance_opt.initial.sphere import random_maps, sphere
 from appearance_opt.latent.build import latent_of
 from appearance_opt.latent.folds import Folds
 from appearance_opt.latent.parameter import Rates
-from appearance_opt.optimize.loop import FitOptions, FitResult, fit
+from appearance_opt.optimize.loop import FitResult, fit
+from appearance_opt.optimize.plan import FitOptions
 from appearance_opt.optimize.validation import Validation
 from appearance_opt.reference.mesh import MeshReference
 from appearance_opt.reference.pool import ReferencePool

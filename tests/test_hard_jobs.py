@@ -18,9 +18,10 @@ from appearance_opt.jobs.simplify import simplify
 from appearance_opt.latent.latent import Latent
 from appearance_opt.latent.mesh import LatentMesh
 from appearance_opt.latent.parameter import Rates
-from appearance_opt.optimize import loop
 from appearance_opt.optimize.checkpoint import Checkpointer
-from appearance_opt.optimize.loop import FitOptions, FitResult, fit
+from appearance_opt.optimize.loop import FitResult, FitRun, fit
+from appearance_opt.optimize.observers import Reporter
+from appearance_opt.optimize.plan import FitOptions
 from appearance_opt.optimize.validation import Validation
 from appearance_opt.reference.mesh import MeshReference
 from appearance_opt.reference.pool import ReferencePool
@@ -197,12 +198,12 @@ def test_a_fit_resumed_anywhere_ends_where_the_whole_one_does(
     chosen = FitOptions(steps=12)
     whole = parts()
     expected = fit(*whole, chosen)
-    first = loop._Run(*parts(), chosen, None, Checkpointer(tmp_path, "x", False, 0.0))
+    first = FitRun(*parts(), chosen, [Checkpointer(tmp_path, "x", False, 0.0)])
     first.look()
     for _ in range(stop):
         first.advance()
     second = parts()
-    result = fit(*second, chosen, None, Checkpointer(tmp_path, "x", True, 1e9))
+    result = fit(*second, chosen, [Checkpointer(tmp_path, "x", True, 1e9)])
     assert [p.step for p in result.curve] == [p.step for p in expected.curve]
     assert result.best_step == expected.best_step
     np.testing.assert_allclose(
@@ -253,6 +254,6 @@ def test_an_interrupted_fit_hands_out_what_it_reached(ball: Asset) -> None:
         pool,
         Validation(reference, SAMPLER.held_out(1).draw(0, 2), 32),
         FitOptions(steps=900),
-        Stop(),
+        [Reporter(Stop())],
     )
     assert result.interrupted and result.best_step == 20

@@ -4,8 +4,8 @@ to start fast."""
 from __future__ import annotations
 
 from appearance_opt.latent.subdivision import MAX_LEVEL
-from appearance_opt.optimize.loop import FIXED_BACKGROUNDS
 from appearance_opt.optimize.losses import LOSSES
+from appearance_opt.optimize.plan import FIXED_BACKGROUNDS
 from appearance_opt.options.fitting import LOSS_NAMES
 from appearance_opt.options.maps import MAX_SUBDIVISION
 from appearance_opt.options.views import BACKGROUNDS

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from appearance_opt.asset.types import Asset
-from appearance_opt.optimize.loop import FitOptions, fit
+from appearance_opt.optimize.loop import fit
+from appearance_opt.optimize.plan import FitOptions
 from experiments.speed_vs_error import tables
 from experiments.speed_vs_error.recorder import Blind, Recorder
 from experiments.speed_vs_error.results import CurveRow, JobRow, read, write
@@ -23,11 +24,11 @@ def test_a_fit_that_is_stopped_and_gone_on_with_equals_one_that_is_not(
     options = FitOptions(steps=8)
     whole, parts = Recorder(()), Recorder(())
     model, pool, _ = make_fit(ball)
-    fit(model, pool, Blind(), options, checkpointer=whole)
+    fit(model, pool, Blind(), options, [whole])
     parts.stop = 0.0
     for _ in range(2):
         model, pool, _ = make_fit(ball)
-        fit(model, pool, Blind(), options, checkpointer=parts)
+        fit(model, pool, Blind(), options, [parts])
     assert [s.step for s in parts.snapshots] == [1, 8]
     for kind in ("values", "means"):
         for name, expected in getattr(whole.snapshots[-1], kind).items():

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from appearance_opt.config import BakeOptions, CommonOptions, JointOptions
     from appearance_opt.jobs.paths import Outputs
     from appearance_opt.jobs.result import Result, SimplifyResult
-    from appearance_opt.optimize.loop import Progress
+    from appearance_opt.progress import Progress
     from appearance_opt.publish import Publication
     from appearance_opt.reference.subject import Subject
 

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from appearance_opt.asset.types import Asset
-    from appearance_opt.optimize.loop import Progress
+    from appearance_opt.progress import Progress
     from appearance_opt.stages.parts import Parts
     from appearance_opt.stages.run import Run
 

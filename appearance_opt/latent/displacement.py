@@ -157,8 +157,7 @@ def footprint(mesh: LatentMesh) -> NDArray[np.float32]:
 
     A lookup with it reads the mip level at which a texel is half as long as an edge, and a bilinear
     one, whose weights reach a texel far on both sides, averages over one edge in all: finer detail
-    could not be held by this mesh, and would alias. Texels as long as an edge average over two,
-    which costs 1.4 dB on chess_king's start.
+    could not be held by this mesh, and would alias (docs/trials.md: displacement).
     """
     length, count = edges_around(mesh.uvs, mesh.frame_faces)
     return np.square(0.5 * length / np.maximum(count, 1)).astype(np.float32)

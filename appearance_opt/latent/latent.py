@@ -38,7 +38,8 @@ P = TypeVar("P", bound="Part")
 
 
 class TracedMesh:
-    """The mesh of one tessellation level, ready to be traced. ``vertices``: flat positions (3 N)."""
+    """The mesh of one tessellation level, ready to be traced, at flat positions ``vertices``
+    (3 N)."""
 
     def __init__(self, mesh: LatentMesh, vertices: mi.Float, tangents: bool) -> None:
         self.topology = LatentTopology(mesh, tangents)

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 class Smoother:
     """x -> (I + ``strength`` L)^-1 x for flat positions (3 V) of a mesh with ``vertices`` vertices
     and ``faces`` (F, 3). ``strength`` is the number of rings squared over which a motion spreads.
-    Factorised once; solved on the host (0.7 ms for 4,700 vertices)."""
+    Factorised once; solved on the host (docs/trials.md: spheres)."""
 
     def __init__(self, vertices: int, faces: NDArray, strength: float) -> None:
         pairs = edges_of(faces)

@@ -1,5 +1,5 @@
-"""Maps as packed texels: their encoding, the mip pyramid that the renderer reads, and the parts of a
-latent that are made of them.
+"""Maps as packed texels: their encoding, the mip pyramid that the renderer reads, and the parts of
+a latent that are made of them.
 
 Colours are stored as the square root of linear values, so that a step of the optimiser means about
 the same to the eye in dark and in light regions. Normals are stored with any length, and mean unit
@@ -45,13 +45,13 @@ MAX_LEVELS = 7
 
 class TexelCodec:
     """Shape and encoding of one packed, square, clamped texture of ``size`` texels (a power of
-    two)."""
+    two), in a pyramid of at most ``levels``."""
 
-    def __init__(self, channels: tuple[str, ...], size: int) -> None:
+    def __init__(self, channels: tuple[str, ...], size: int, levels: int = MAX_LEVELS) -> None:
         self.channels = channels
         self.size = size
         self.packed = 1 << (len(channels) - 1).bit_length()
-        self.layout = pyramid_layout([(size, size)], self.packed, [CLAMP], MAX_LEVELS)
+        self.layout = pyramid_layout([(size, size)], self.packed, [CLAMP], levels)
         self._template = Pyramid.of(self.layout, mi.Float(0))
         self._normal = (
             [channels.index(name) for name in NORMALS] if set(NORMALS) <= set(channels) else []
@@ -178,12 +178,14 @@ def maps_of(values: Mapping[str, NDArray | float]) -> MaterialMaps:
 
 
 class PackedMaps(Part):
-    """Maps in one atlas, whose mip levels are means of its texels. ``images``: natural values,
-    channel name -> (size, size)."""
+    """Maps in one atlas, whose at most ``levels`` mip levels are means of its texels. ``images``:
+    natural values, channel name -> (size, size)."""
 
-    def __init__(self, name: str, images: Mapping[str, NDArray], fitted: bool) -> None:
+    def __init__(
+        self, name: str, images: Mapping[str, NDArray], fitted: bool, levels: int = MAX_LEVELS
+    ) -> None:
         channels = tuple(images)
-        self.codec = codec = TexelCodec(channels, len(images[channels[0]]))
+        self.codec = codec = TexelCodec(channels, len(images[channels[0]]), levels)
         stored = codec.encode(images)
         if not fitted:
             super().__init__(name, None, codec.layer(stored))
@@ -210,8 +212,10 @@ class Texels(PackedMaps):
     """Maps of the material. Those that are fitted and those that are not are parts of their own:
     the latter have no gradient and no moments."""
 
-    def __init__(self, images: Mapping[str, NDArray], fitted: bool) -> None:
-        super().__init__(TEXELS if fitted else FIXED_TEXELS, images, fitted)
+    def __init__(
+        self, images: Mapping[str, NDArray], fitted: bool, levels: int = MAX_LEVELS
+    ) -> None:
+        super().__init__(TEXELS if fitted else FIXED_TEXELS, images, fitted, levels)
         self.channels = self.codec.channels
         self._start = None if self.parameter is None else self.parameter.value
         self._images = {} if fitted else {n: v.astype(np.float32) for n, v in images.items()}

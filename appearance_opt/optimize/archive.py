@@ -32,7 +32,7 @@ FILES = (STATE_FILE, START_FILE)
 
 HEAD, SUFFIX, TEMPORARY = "archive.json", ".npy", ".tmp"
 
-FORMAT = "appearance-opt archive 2"
+FORMAT = "appearance-opt archive 3"
 
 
 class DamagedError(Exception):

@@ -4,45 +4,30 @@ from __future__ import annotations
 
 import logging
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
 from appearance_opt.digest import digest
 from appearance_opt.errors import InputError
 from appearance_opt.lock import FOLDER_LOCK
 from appearance_opt.optimize import archive
 from appearance_opt.optimize.adam import Moments
+from appearance_opt.optimize.observers import Observer
+from appearance_opt.optimize.state import CurvePoint, FitState
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from appearance_opt.latent.latent import Latent
+    from appearance_opt.optimize.observers import Running
 
 log = logging.getLogger(__name__)
 
 T = TypeVar("T")
-
-
-@dataclass
-class FitState:
-    """Everything that a fit changes, but the parameters."""
-
-    moments: dict[str, Moments]
-    iteration: int = 0
-    loss: float = float("nan")
-    laplacian: float = 0.0
-    skipped: int = 0
-    seconds: float = 0.0
-    best: dict[str, mi.Float] | None = None
-    best_psnr: float = -np.inf
-    best_iteration: int = 0
-    unfolded: int = 0
-    curve: list[tuple[float, int, float, float]] = field(default_factory=list)
 
 
 @dataclass
@@ -55,7 +40,11 @@ class Kept:
     state: FitState
 
 
-class Checkpointer:
+CLASSES = (Kept, FitState, Moments, CurvePoint)
+"""What a checkpoint is made of."""
+
+
+class Checkpointer(Observer):
     """Keeps start and state of one job in a folder, the state at most every ``interval`` seconds.
 
     ``fingerprint`` identifies input and options: a checkpoint of another job is refused. Without
@@ -128,6 +117,16 @@ class Checkpointer:
         self.start_hash = digest(start)
         return start, interrupted
 
+    def begin(self, latent: Latent, state: FitState) -> None:
+        self.restore(latent, state)
+
+    def stepped(self, fit: Running) -> None:
+        if self.due():
+            self.save(fit.latent, fit.state)
+
+    def ended(self, fit: Running) -> None:
+        self.save(fit.latent, fit.state)
+
     def due(self) -> bool:
         """Is it time for another checkpoint?"""
         return time.monotonic() - self._last >= self.interval
@@ -156,7 +155,7 @@ class Checkpointer:
             log.info("no checkpoint in %s: starting from the beginning", self.folder)
             return False
         try:
-            kept = archive.read(self.path, self.fingerprint, (Kept, FitState, Moments), mi.Float)
+            kept = archive.read(self.path, self.fingerprint, CLASSES, mi.Float)
             _check(kept, latent)
         except archive.DamagedError as error:
             raise InputError(

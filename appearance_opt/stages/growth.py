@@ -28,7 +28,9 @@ from appearance_opt.latent.latent import Latent
 from appearance_opt.latent.mesh import LatentMesh
 from appearance_opt.latent.parameter import Rates
 from appearance_opt.latent.positions import Positions
-from appearance_opt.optimize.loop import FitOptions, FitResult, fit
+from appearance_opt.optimize.loop import FitResult, fit
+from appearance_opt.optimize.observers import Observer, Reporter, Stop
+from appearance_opt.optimize.plan import FitOptions
 from appearance_opt.optimize.validation import Validation
 from appearance_opt.reference.mesh import MeshReference
 from appearance_opt.reference.pool import ReferencePool
@@ -44,7 +46,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from appearance_opt.config import SimplifyOptions
-    from appearance_opt.optimize.loop import Progress
+    from appearance_opt.progress import Progress
     from appearance_opt.reference.subject import Subject
     from appearance_opt.views import ViewSampler
 
@@ -185,9 +187,10 @@ def _fit_shape(
         seed=options.views.seed,
     )
     effort.interrupts.protect()
-    result = fit(
-        model, pool, validation, fit_options, effort.progress, stop=effort.interrupts.asked
-    )
+    observers: list[Observer] = [Stop(effort.interrupts.asked)]
+    if effort.progress is not None:
+        observers.append(Reporter(effort.progress))
+    result = fit(model, pool, validation, fit_options, observers)
     log.info(
         "shape by preconditioned steps: %d of them, %.2f dB", result.steps, result.curve[-1].psnr
     )

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from appearance_opt.optimize.checkpoint import Checkpointer
-    from appearance_opt.optimize.loop import Progress
+    from appearance_opt.progress import Progress
 
 EXPORT_SECONDS = 1.0
 """Time kept back from the budget for writing the result; the report has a reserve of its own."""

@@ -59,7 +59,8 @@ def limits(asset: str, steps: int, views: int) -> dict:
     from appearance_opt.baking.closed_form import Settings, bake
     from appearance_opt.latent.build import latent_of
     from appearance_opt.latent.parameter import Rates
-    from appearance_opt.optimize.loop import FitOptions, fit
+    from appearance_opt.optimize.loop import fit
+    from appearance_opt.optimize.plan import FitOptions
     from appearance_opt.optimize.validation import Validation
     from appearance_opt.reference.pool import ReferencePool
     from appearance_opt.stages.fitting import POOL_SAMPLES, fit_policy, point_width

@@ -107,8 +107,8 @@ def run_case(
     """Median and range in ms of a whole step, the sum of its kernels, kernels compiled, peak
     memory."""
     from appearance_opt.optimize import adam
-    from appearance_opt.optimize.loop import LOSS_EVERY
     from appearance_opt.optimize.losses import LOSSES
+    from appearance_opt.optimize.plan import LOSS_EVERY
     from appearance_opt.optimize.step import Gradients, StepInputs, first_non_finite, step
     from appearance_opt.options.views import ViewOptions
     from appearance_opt.reference.pool import ReferencePool, Targets

@@ -17,7 +17,7 @@ from appearance_opt.latent.build import latent_of
 from appearance_opt.latent.latent import Latent
 from appearance_opt.latent.parameter import Rates
 from appearance_opt.latent.positions import Positions
-from appearance_opt.optimize.loop import FitOptions
+from appearance_opt.optimize.plan import FitOptions
 from appearance_opt.optimize.validation import Validation
 from appearance_opt.reference.pool import ReferencePool
 from appearance_opt.reference.subject import Subject

@@ -60,7 +60,8 @@ class Bench:
         views."""
         from appearance_opt.latent.build import latent_of
         from appearance_opt.latent.parameter import Rates
-        from appearance_opt.optimize.loop import FitOptions, fit
+        from appearance_opt.optimize.loop import fit
+        from appearance_opt.optimize.plan import FitOptions
         from appearance_opt.stages.fitting import fit_policy
 
         parts, numbers = case.split(":")

@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
-from contextlib import ExitStack
 from dataclasses import astuple, dataclass, replace
 from typing import TYPE_CHECKING
-from unittest import mock
 
 import drjit as dr
 import numpy as np
 
 from appearance_opt.latent.build import latent_of
+from appearance_opt.latent.latent import Latent
 from appearance_opt.latent.parameter import Rates
+from appearance_opt.latent.parts import Pose
 from appearance_opt.latent.positions import Positions
-from appearance_opt.optimize.loop import FitOptions, fit
+from appearance_opt.latent.texels import Texels
+from appearance_opt.optimize.loop import fit
+from appearance_opt.optimize.plan import FitOptions, Plan
 from appearance_opt.optimize.validation import Validation
 from appearance_opt.reference.pool import ReferencePool
+from appearance_opt.render.material import CHANNELS
 from appearance_opt.stages.fitting import VALIDATION_VIEWS, fit_policy
 from appearance_opt.views import VALIDATION
 from experiments.speed_vs_error.recorder import Blind, Recorder, Snapshot
@@ -32,7 +35,7 @@ FRACTIONS = (1 / 16, 1 / 8, 1 / 4, 1 / 2)
 
 WARM_UP_STEPS = 12
 """Steps of a fit that is thrown away before each: kernels are compiled or loaded in it. More than
-``optimize.loop.LOSS_EVERY``, so that both kinds of step occur."""
+``optimize.plan.LOSS_EVERY``, so that both kinds of step occur."""
 
 CONSTANT = {
     "red": 0.2, "green": 0.2, "blue": 0.2, "roughness": 0.5, "metalness": 0.0,
@@ -60,17 +63,8 @@ def run(bench: Bench, setup: Setup, seconds: float) -> Run:
     )
     start = replace(start, maps=maps)
     setup = replace(setup, rates=setup.rates or _rates(bench, start))
-    with ExitStack() as patches:
-        # not options of the product: nobody needs them but this question
-        if not setup.mip:
-            patches.enter_context(mock.patch("appearance_opt.latent.texels.MAX_LEVELS", 1))
-        if not setup.laplacian_decays:
-            patches.enter_context(
-                mock.patch("appearance_opt.optimize.loop.laplacian_weight", lambda first, _: first)
-            )
-        return Run(
-            bench, start, _timed(bench, start, setup, seconds), (setup.texture, setup.closed_form)
-        )
+    snapshots = _timed(bench, start, setup, seconds)
+    return Run(bench, start, snapshots, (setup.texture, setup.closed_form))
 
 
 @dataclass(frozen=True)
@@ -124,7 +118,7 @@ def _fit(
     seconds: float | None = None,
 ) -> None:
     """A fit of a fresh model, or one gone on with by the recorder, at one resolution."""
-    model = latent_of(start.mesh, start.maps, PARTS, _scaled(setup.rates, setup.rate_factor))
+    model = _latent(start, setup)
     if setup.smoothing:
         positions = model.fitted(Positions)
         assert positions is not None
@@ -145,8 +139,23 @@ def _fit(
         steps=steps, seconds=seconds, loss=setup.loss, laplacian=setup.laplacian, relative=setup.relative,
         decay=setup.decay, quality=setup.quality, validate_every=2.0, seed=setup.seed,
     )  # fmt: skip
-    fit(model, pool, Blind(), options, checkpointer=recorder)
+    plan = Plan.of(options, model.poses, pool.batch)
+    if not setup.laplacian_decays:
+        plan = replace(plan, laplacian=lambda _: 1.0)
+    fit(model, pool, Blind(), options, [recorder], plan)
     dr.sync_thread()
+
+
+def _latent(start: Start, setup: Setup) -> Latent:
+    """The start, ready to be fitted."""
+    if setup.mip:
+        out = latent_of(start.mesh, start.maps, PARTS)
+    else:
+        images = {n: np.asarray(start.maps[n]) for n in CHANNELS if n in start.maps}
+        parts = (Positions(start.mesh, True), Texels(images, True, levels=1))
+        out = Latent(start.mesh, parts, {}, (Pose(),))
+    out.set_rates(_scaled(setup.rates, setup.rate_factor))
+    return out
 
 
 def _rates(bench: Bench, start: Start) -> Rates:

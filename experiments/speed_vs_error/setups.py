@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 
 from appearance_opt.config import simplify_options
 from appearance_opt.latent.parameter import Rates
-from appearance_opt.optimize.loop import FitOptions
+from appearance_opt.optimize.plan import FitOptions
 from appearance_opt.options.views import ViewOptions
 from appearance_opt.render.quality import Quality
 from appearance_opt.stages import fitting, growth
