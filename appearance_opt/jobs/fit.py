@@ -27,7 +27,7 @@ from appearance_opt.stages.parts import Parts, split
 
 if TYPE_CHECKING:
     from appearance_opt.latent.mesh import LatentMesh
-    from appearance_opt.optimize.loop import Progress
+    from appearance_opt.progress import Progress
     from appearance_opt.reference.base import Reference
     from appearance_opt.stages.run import Run
 

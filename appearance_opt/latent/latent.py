@@ -11,6 +11,7 @@ import numpy as np
 
 from appearance_opt.latent.laplacian import Laplacian
 from appearance_opt.latent.mesh import LatentTopology, local_edge_length
+from appearance_opt.latent.parts import Pose
 from appearance_opt.latent.positions import POSITIONS
 from appearance_opt.render import upload
 from appearance_opt.render.drawn import Drawn
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
 
     from appearance_opt.latent.mesh import LatentMesh
     from appearance_opt.latent.parameter import Parameter, Rates
-    from appearance_opt.latent.parts import Guard, Part, Pose
+    from appearance_opt.latent.parts import Guard, Part
     from appearance_opt.render.passing import Scene
     from appearance_opt.render.silhouette import EdgeList
     from appearance_opt.render.surface import Surface
@@ -75,12 +76,15 @@ class Latent:
         }
         self._fitted = tuple(p for p in parts if p.parameter is not None)
         self._placing = tuple(p for p in parts if p.places)
-        self._moving = any(p.places for p in self._fitted)
+        self._deforms = any(p.places for p in self._fitted)
+        self._moving = self._deforms or any(p.frame is not None for p in poses)
         tangents = any("normal_x" in p.channels for p in parts)
-        self._traced = {
-            pose.level: TracedMesh(self._mesh_of(pose.level), self.vertices(pose=pose), tangents)
-            for pose in poses
-        }
+        self._traced: dict[int, TracedMesh] = {}
+        for level in {p.level: None for p in poses}:
+            at_rest = self.vertices(pose=Pose(level))
+            self._traced[level] = TracedMesh(self._mesh_of(level), at_rest, tangents)
+        if self.pose.frame is not None:
+            self.update_scene()
 
     # what is fitted
 
@@ -121,13 +125,13 @@ class Latent:
         return {name: guard for name, guard in found.items() if guard is not None}
 
     def laplacians(self, relative: bool) -> dict[int, Laplacian]:
-        """The regularizer of the drawn mesh by tessellation level, relative to where it is now, or
-        to 0. Empty if no vertex can move."""
+        """The regularizer of the mesh at rest by tessellation level, relative to where it is now,
+        or to 0. Empty if no vertex can move."""
         out = {}
-        for pose in self.poses if self._moving else ():
-            mesh = self.posed_mesh(pose)
+        for level in self._traced if self._deforms else ():
+            mesh = self.posed_mesh(Pose(level))
             length = local_edge_length(mesh.positions, mesh.faces)
-            out[pose.level] = Laplacian(mesh.positions, mesh.faces, length, relative)
+            out[level] = Laplacian(mesh.positions, mesh.faces, length, relative)
         return out
 
     # how it is drawn
@@ -212,8 +216,8 @@ class Latent:
         return {n: v for p in self.parts if p.channels for n, v in p.export().items()}
 
     def posed_mesh(self, pose: Pose | None = None) -> LatentMesh:
-        """The mesh as it is drawn at a pose (by default the finest), where it is now."""
-        pose = pose or max(self.poses, key=lambda p: p.level)
+        """The mesh as it is drawn at a pose (by default at rest, the finest), where it is now."""
+        pose = pose or Pose(max(self._traced))
         positions = np.array(self.vertices(pose=pose)).reshape(-1, 3)
         return replace(self._traced[pose.level].topology.mesh, positions=positions)
 

@@ -9,6 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from appearance_opt.latent.parts import Pose
 from appearance_opt.optimize import adam
 from appearance_opt.optimize.losses import Target, compared_pixels, covered_loss, image_loss
 from appearance_opt.render import gradient
@@ -21,7 +22,6 @@ if TYPE_CHECKING:
 
     from appearance_opt.latent.laplacian import Laplacian
     from appearance_opt.latent.latent import Decoded, Latent, Values
-    from appearance_opt.latent.parts import Pose
     from appearance_opt.optimize.losses import Loss
     from appearance_opt.reference.pool import Targets
     from appearance_opt.render.freezing import Run
@@ -158,7 +158,8 @@ class Gradients:
         if direct is not None:
             terms.append(direct)
         if dr.grad_enabled(vertices) and pose.level in self.laplacians:
-            terms.append(self.laplacians[pose.level].per_vertex(vertices) * laplacian_weight)
+            rest = vertices if pose.frame is None else latent.vertices(tracked, Pose(pose.level))
+            terms.append(self.laplacians[pose.level].per_vertex(rest) * laplacian_weight)
         gradient.backward(terms)
         value = dr.detach(direct) if want_loss and direct is not None else None
         return value, latent.gradients(tracked, stored)
