@@ -166,11 +166,17 @@ def test_verdicts_say_what_was_measured() -> None:
         "Differences are invisible at 384 pixels, the largest size measured."
     )
     assert say(sizes(0.2, 0.012, 0.01)) == (
-        "Differences are invisible at 96 pixels and visible in 20 % of the pixels at 384."
+        "Differences are invisible at 96 pixels; at 384, an eye that flips between the two notices "
+        "20 % of the pixels."
     )
-    assert say(sizes(0.2, 0.06, 0.04)).startswith("Differences are hardly visible at 96 pixels")
+    assert say(sizes(0.2, 0.06, 0.04)).startswith("Differences are hardly visible at 96 pixels; at")
+    assert say(sizes(0.04, 0.02)).startswith("Differences are hardly visible at 384 pixels: an eye")
     assert say(sizes(0.2, 0.0, 0.3)) == (  # what is seen when it is smaller is not invisible
-        "Differences are visible at every size: in 30 % of the pixels at 96 pixels, in 20 % at 384."
+        "At 384 pixels, an eye that flips between the two notices 20 % of the pixels, at 96 30 % of "
+        "them."
+    )
+    assert say(sizes(0.2)) == (
+        "At 384 pixels, an eye that flips between the two notices 20 % of the pixels."
     )
     assert [percent(x) for x in (0, 0.00004, 0.0123, 0.0996, 1)] == [
         "0 %",

@@ -38,6 +38,7 @@ class Comparison:
             f"PSNR, covered pixels  {m.psnr_covered:7.2f} dB",
             f"PSNR, whole image     {m.psnr:7.2f} dB",
             f"FLIP                  {m.flip:7.4f}",
+            f"pixels noticed        {100 * m.noticed:7.2f} %",
             f"silhouette IoU        {m.silhouette_iou:7.4f}",
             f"silhouette shift      {m.silhouette_shift:7.3f} px",
         ]

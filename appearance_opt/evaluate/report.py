@@ -308,10 +308,11 @@ def _viewer(data: ReportData) -> tuple[str, str]:
     lead = "Drag to turn, shift-drag to move, wheel or two fingers to zoom; arrow keys work, too. "
     lead += "Textures are compressed for this page."
     original = shown.get("original")
-    if original is None:
+    if original is None and "original" in data.previews:
         lead += " The original is too large for it."
-    elif original.reduced is not None:
-        lead += f" The original is shown with {original.reduced:,} triangles."
+    for name, preview in shown.items():
+        if preview.reduced is not None:
+            lead += f" The {name} is shown with {preview.reduced:,} triangles."
     show = {"result": "Result", "original": "Original", "both": "Both"}
     looks = {
         "shaded": "Shaded",

@@ -81,52 +81,68 @@ def show(
     images = {name: render_asset(a, views, size, samples) for name, a in columns.items()}
     metrics = {name: compare_images(drawn, image) for name, image in images.items()}
     last = list(columns)[-1]
-    final = columns[last]
 
     assert sampler.hull is not None
-    upright = hero_view(sampler.hull, lambda v: reference.render(v, SMALL, 4))
-    if original is None:
-        first = check_images(
-            reference.render(upright, looks.pictured, samples), 1, looks.pictured, "the report"
-        )
-        second = render_asset(final, upright, looks.pictured, samples)
-        light = "a lamp"
-    else:
-        lights = distant_lights(LIGHTS)
-        first, second = (
-            render_environment(a, upright, looks.pictured, lights) for a in (original, final)
-        )
-        light = "a sky and three lamps"
-    wires = triangle_images(final, upright, 2 * looks.pictured)
-    pictured = [
-        {
-            "reference": pictures.picture(r),
-            "result": pictures.picture(c),
-            "wireframe": pictures.wireframe(c, t),
-        }
-        for r, c, t in zip(first, second, wires, strict=True)
-    ]
-    worst = int(np.argmax([v.flip for v in metrics[last].views]))
-    pictured.append(
-        {
-            "reference": pictures.picture(drawn[worst]),
-            "result": pictures.picture(images[last][worst]),
-        }
+    hero = picture_upright(
+        reference, original, columns[last], sampler.hull, looks.pictured, samples
     )
-    captions = [
-        f"under {light}",
-        f"of the {len(views)} random views the one that differs most (FLIP), under its lamp",
-    ]
+    worst = int(np.argmax([v.flip for v in metrics[last].views]))
+    random = {
+        "reference": pictures.picture(drawn[worst]),
+        "result": pictures.picture(images[last][worst]),
+    }
+    caption = f"of {len(views)} random views the one that differs most (FLIP), under its lamp"
     previews = {} if original is None else {"original": preview_of(original)}
-    x, y, z = upright.eye[0] / np.linalg.norm(upright.eye[0])
     return Shown(
         metrics=metrics,
         by_size=at_sizes(drawn, images[last], metrics[last]),
-        views=pictured,
-        captions=captions,
+        views=[hero.pictures, random],
+        captions=[hero.caption, caption],
         previews={**previews, "result": preview_of(result)},
-        azimuth=float(np.degrees(np.arctan2(x, z))),
-        elevation=float(np.degrees(np.arcsin(y))),
+        azimuth=hero.azimuth,
+        elevation=hero.elevation,
+    )
+
+
+@dataclass
+class Upright:
+    """Pictures of one upright view by name, and where it stands, in degrees."""
+
+    pictures: dict[str, NDArray[np.uint8]]
+    caption: str
+    azimuth: float
+    elevation: float
+
+
+def picture_upright(
+    reference: Reference,
+    original: Asset | None,
+    final: Asset,
+    points: NDArray,
+    size: int,
+    samples: int = 9,
+) -> Upright:
+    """Original, result and its wireframe from the side that shows most, ``size`` pixels wide.
+    ``points`` (N, 3): of the original; ``original``: what ``reference`` was made from, or None."""
+    view = hero_view(points, lambda v: reference.render(v, SMALL, 4))
+    if original is None:
+        first = check_images(reference.render(view, size, samples), 1, size, "the report")
+        second, light = render_asset(final, view, size, samples), "a lamp"
+    else:
+        lights = distant_lights(LIGHTS)
+        first, second = (render_environment(a, view, size, lights) for a in (original, final))
+        light = "a sky and three lamps"
+    wires = triangle_images(final, view, 2 * size)
+    x, y, z = view.eye[0] / np.linalg.norm(view.eye[0])
+    return Upright(
+        {
+            "reference": pictures.picture(first[0]),
+            "result": pictures.picture(second[0]),
+            "wireframe": pictures.wireframe(second[0], wires[0]),
+        },
+        f"under {light}",
+        float(np.degrees(np.arctan2(x, z))),
+        float(np.degrees(np.arcsin(y))),
     )
 
 

@@ -48,24 +48,25 @@ def describe_visibility(sizes: list[AtSize]) -> str:
     """One sentence on the sizes, which come the largest first. It says no more than was measured.
 
     >>> describe_visibility([AtSize(96, 0.2, 30, 0.1), AtSize(48, 0.004, 40, 0.01)])
-    'Differences are invisible at 48 pixels and visible in 20 % of the pixels at 96.'
+    'Differences are invisible at 48 pixels; at 96, an eye that flips between the two notices 20 % of the pixels.'
     """
-    largest = sizes[0]
+    largest, smallest = sizes[0], sizes[-1]
+    noticed = f"an eye that flips between the two notices {percent(largest.noticed)} of the pixels"
     unseen = _largest(sizes, INVISIBLE)
-    faint = _largest(sizes, HARDLY)
     if unseen is largest:
         return f"Differences are invisible at {largest.pixels} pixels, the largest size measured."
-    seen = f"visible in {percent(largest.noticed)} of the pixels at {largest.pixels}"
-    if unseen is not None:
-        return f"Differences are invisible at {unseen.pixels} pixels and {seen}."
-    if faint is not None:
-        return f"Differences are hardly visible at {faint.pixels} pixels and {seen}."
-    small = sizes[-1]
-    if small is largest:
-        return f"Differences are {seen} pixels."
+    for found, how in ((unseen, "invisible"), (_largest(sizes, HARDLY), "hardly visible")):
+        if found is largest:
+            return f"Differences are {how} at {largest.pixels} pixels: {noticed}."
+        if found is not None:
+            return (
+                f"Differences are {how} at {found.pixels} pixels; at {largest.pixels}, {noticed}."
+            )
+    if smallest is largest:
+        return f"At {largest.pixels} pixels, {noticed}."
     return (
-        f"Differences are visible at every size: in {percent(small.noticed)} of the pixels at "
-        f"{small.pixels} pixels, in {percent(largest.noticed)} at {largest.pixels}."
+        f"At {largest.pixels} pixels, {noticed}, at {smallest.pixels} "
+        f"{percent(smallest.noticed)} of them."
     )
 
 

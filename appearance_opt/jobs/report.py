@@ -14,10 +14,12 @@ from appearance_opt.config import as_dict
 from appearance_opt.evaluate import pictures
 from appearance_opt.evaluate.preview import preview_of
 from appearance_opt.evaluate.report import Option, ReportData, write_report
-from appearance_opt.evaluate.showing import Looks, show
+from appearance_opt.evaluate.showing import Looks, picture_upright, show
 from appearance_opt.evaluate.sizes import sizes_of
 from appearance_opt.evaluate.verdict import at_sizes
 from appearance_opt.options.option import entries, flag_name
+from appearance_opt.reference.mesh import MeshReference
+from appearance_opt.views import support
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -32,8 +34,8 @@ if TYPE_CHECKING:
 
 LOOKS = Looks()
 
-MOST_VIEWS, MOST_LINKS = 4, 8
-"""Views of a comparison that a page shows, those that differ most first; files that it links to."""
+MOST_VIEWS, MOST_LINKS = 3, 8
+"""Random views of a comparison that a page shows, those that differ most first; files that it links to."""
 
 COLUMNS = {
     "start": "before any fitting: decimated, with maps that rays have baked",
@@ -88,7 +90,9 @@ def write_compare_report(
 ) -> None:
     """Report of a comparison."""
     original, other = placement.local(reference), placement.local(candidate)
-    files = {"original": reference.files, "result": candidate.files}
+    points = np.concatenate([a.points() for a in (original, other)])
+    drawn = MeshReference(original)
+    hero = picture_upright(drawn, original, other, support(points), LOOKS.pictured)
     most = [int(k) for k in np.argsort([-v.flip for v in result.metrics.views])][:MOST_VIEWS]
     data = ReportData(
         title=f"{candidate.name} against {reference.name}",
@@ -97,22 +101,27 @@ def write_compare_report(
         metrics={"candidate": result.metrics},
         by_size=at_sizes(result.reference, result.candidate, result.metrics),
         views=[
-            {
-                "reference": pictures.picture(result.reference[k]),
-                "result": pictures.picture(result.candidate[k]),
-            }
-            for k in most
+            hero.pictures,
+            *(
+                {
+                    "reference": pictures.picture(result.reference[k]),
+                    "result": pictures.picture(result.candidate[k]),
+                }
+                for k in most
+            ),
         ],
-        captions=[f"view {k + 1} of {len(result.reference)}" for k in most],
+        captions=[hero.caption, *(f"random view {k + 1} of {options.views}" for k in most)],
         maps=pictures.texture_pictures(candidate),
         notes=[*reference.notes, *candidate.notes],
         columns={"candidate": f"{candidate.name}, called the result on this page"},
         sizes={
-            "original": sizes_of(reference, files["original"]),
-            "result": sizes_of(candidate, files["result"]),
+            "original": sizes_of(reference, reference.files),
+            "result": sizes_of(candidate, candidate.files),
         },
         links=_links(folder, (*reference.files[:1], *candidate.files[:1])),
         previews={"original": preview_of(original), "result": preview_of(other)},
+        azimuth=hero.azimuth,
+        elevation=hero.elevation,
     )
     write_report(folder, data)
 
