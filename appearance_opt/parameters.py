@@ -11,9 +11,10 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperCommand
 
-from appearance_opt.config import JOBS, PRESETS, make_options, read_toml
+from appearance_opt.config import make_options, read_toml
 from appearance_opt.errors import InputError
 from appearance_opt.jobs.spec import JobSpec
+from appearance_opt.options.jobs import JOBS, PRESETS
 from appearance_opt.options.option import Entry, entries, flag_name
 
 PANELS = ("Input", "Start", "Fit", "Displacement", "Baking", "Views", "Output", "Run")

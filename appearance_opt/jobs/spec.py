@@ -18,7 +18,7 @@ _OWN = ("job", "inputs", "out")
 
 @dataclass(frozen=True)
 class JobSpec:
-    """``kind``: a key of ``config.JOBS``. ``inputs``: paths, or assets, in the order of its
+    """``kind``: a key of ``options.jobs.JOBS``. ``inputs``: paths, or assets, in the order of its
     ``inputs``. ``out``: file or folder of the result; None: nothing is written. Raises InputError
     for what does not belong together."""
 
