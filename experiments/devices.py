@@ -45,6 +45,8 @@ def arrays() -> dict[str, NDArray[np.float32]]:
     from appearance_opt.optimize.losses import LOSSES
     from appearance_opt.optimize.step import Gradients, StepInputs
     from appearance_opt.reference.pool import Targets
+    from appearance_opt.render.boundary.camera_rays import CameraRays
+    from appearance_opt.render.boundary.pairs import Pairs
     from appearance_opt.render.pixels import Grid
     from appearance_opt.render.quality import Quality
     from experiments.bench.scene import set_up
@@ -54,8 +56,8 @@ def arrays() -> dict[str, NDArray[np.float32]]:
     out = {"reference image": source.render(views, RESOLUTION, 16)}
     target = Targets(backend.to_device(out["reference image"]))
     inputs = StepInputs(views, target, np.full((VIEWS, 3), 0.3, np.float32), 0.0, 1.0, 0)
-    for visibility in ("edges", "pairs"):
-        quality = Quality(visibility=visibility)
+    for visibility, estimator in (("edges", CameraRays()), ("pairs", Pairs())):
+        quality = Quality(visibility=estimator)
         loss, gradients = Gradients(model, grid, quality, LOSSES["log-srgb-l1"])(inputs)
         out[f"loss ({visibility})"] = np.array(loss)
         out |= {f"gradient of {name} ({visibility})": np.array(g) for name, g in gradients.items()}

@@ -13,7 +13,10 @@ from appearance_opt.asset.tangents import split_and_tangents
 from appearance_opt.initial.sphere import sphere
 from appearance_opt.latent.build import latent_of
 from appearance_opt.latent.parameter import Rates
-from appearance_opt.render import coverage, gradient
+from appearance_opt.render import gradient
+from appearance_opt.render.boundary import coverage
+from appearance_opt.render.boundary.camera_rays import CameraRays
+from appearance_opt.render.boundary.edges import Edges
 from appearance_opt.render.images import render_image
 from appearance_opt.render.lattice import sub_pixel_offsets
 from appearance_opt.render.pixels import Batch, Grid
@@ -60,11 +63,12 @@ def test_silhouettes_know_the_coverage_of_their_pixels() -> None:
     model = latent_of(mesh, constants, frozenset(("shape",)), Rates())
     grid, records = Grid(2, 64), ViewSampler((0.0, 0.0, 0.0), 1.0, seed=5).draw(0, 2).records()
     drawn, batch = drawn_of(model), Batch(records, grid)
-    quality = Quality(4.0, 4, 1)
+    quality = Quality(visibility=CameraRays((Edges(4.0),), 4))
     with dr.suspend_grad():
         rendered = gradient.render(drawn, batch, quality, 0)
         exact = render_image(drawn, batch, 1024)
-    crossed = np.unique(np.array(rendered.edges.pixel))
+    (points,) = rendered.seen.boundaries
+    crossed = np.unique(np.array(points.pixel))
     error = (np.array(rendered.image) - np.array(exact)).reshape(-1, 4)[crossed, 3]
     # measured 0.022; by the same four rays alone 0.095
     assert np.sqrt(np.mean(error**2)) < 0.05
@@ -147,7 +151,9 @@ def test_vertex_gradients_of_a_triangle_are_those_of_its_box_filtered_image() ->
     fields = smooth_fields(problem.positions, 6, 1)
     target, truth = differences_along(problem, fields, 256)
     ours = Ours(problem, target, "log-srgb-l1")
-    g = np.stack([ours(Quality(2.0, 4, 1), seed) for seed in range(4)])
+    g = np.stack(
+        [ours(Quality(visibility=CameraRays((Edges(2.0),), 4)), seed) for seed in range(4)]
+    )
     error = error_of(np.einsum("rvc,nvc->rn", g, fields), truth)
     # measured 0.035 and +1.8 %; at 128 squared pixels 0.27 and -23 % by four rays off centre alone
     assert error.relative < 0.08 and abs(error.bias) < 0.03

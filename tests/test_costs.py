@@ -18,7 +18,7 @@ from appearance_opt.asset.rows import count_unique_rows, rank_rows, unique_rows
 from appearance_opt.asset.types import Asset, Material, Mesh, Texture
 from appearance_opt.asset.validate import Validation
 from appearance_opt.reference import mesh as mesh_reference
-from appearance_opt.render import texture
+from appearance_opt.render.texture_upload import Base, build_pyramid
 from tests.conftest import grid_sphere
 from tests.test_asset_gltf import write_glb
 from tests.test_asset_gltf_nodes import ball, document
@@ -304,7 +304,7 @@ def test_many_meshes_are_merged_in_one_go_as_each_alone(monkeypatch: pytest.Monk
 def test_materials_of_all_sizes_share_one_buffer() -> None:
     rng = np.random.default_rng(0)
     bases = [rng.random((n, n, 8)).astype(np.float32) for n in (1, 1, 2, 1, 1, 1)]
-    pyramid = texture.build_pyramid([texture.Base.of(b) for b in bases], [0] * len(bases))
+    pyramid = build_pyramid([Base.of(b) for b in bases], [0] * len(bases))
     texels = np.array(pyramid.texels).reshape(-1, 8)
     for base, offsets in zip(bases, pyramid.layout.offsets, strict=True):
         np.testing.assert_array_equal(

@@ -22,6 +22,7 @@ from appearance_opt.latent.texels import TEXELS, TexelCodec, Texels
 from appearance_opt.optimize.losses import LOSSES
 from appearance_opt.optimize.step import Gradients, StepInputs
 from appearance_opt.reference.pool import Targets
+from appearance_opt.render.boundary.camera_rays import CameraRays
 from appearance_opt.render.pixels import Grid
 from appearance_opt.render.quality import Quality
 from appearance_opt.views import look_at
@@ -254,7 +255,7 @@ def test_derivatives_of_the_image(of: str) -> None:
     grid = Grid(2, 96)
     reference = mi.Float(np.tile(np.array([0.1, 0.1, 0.1, 1], np.float32), grid.pixels))
     inputs = StepInputs(views, Targets(reference), np.zeros((2, 3), np.float32), 0.0, 0.0, 3)
-    quality = Quality(0.0, 1, 4)
+    quality = Quality(4, visibility=CameraRays(()))
 
     def run() -> tuple[float, dict]:
         loss, grads = Gradients(model, grid, quality, LOSSES["l2"], freeze=False)(inputs)

@@ -32,6 +32,8 @@ from appearance_opt.optimize.step import Gradients, StepInputs
 from appearance_opt.optimize.validation import Validation
 from appearance_opt.reference.mesh import MeshReference
 from appearance_opt.reference.pool import ReferencePool
+from appearance_opt.render.boundary.camera_rays import CameraRays
+from appearance_opt.render.boundary.pairs import Pairs
 from appearance_opt.render.quality import Quality
 from appearance_opt.stages.fitting import fit_policy
 from appearance_opt.views import ViewSampler
@@ -69,7 +71,10 @@ def make_fit(
 def test_a_fit_finds_a_painted_ball(ball: Asset) -> None:
     model, pool, validation = make_fit(ball)
     result = fit(
-        model, pool, validation, FitOptions(steps=300, quality=Quality(1.0, 4, 1), relative=False)
+        model,
+        pool,
+        validation,
+        FitOptions(steps=300, quality=Quality(visibility=CameraRays(samples=4)), relative=False),
     )
     # from random colours on a smaller sphere: measured 13.8 -> 27.1 dB
     assert result.curve[0].psnr < 15
@@ -94,7 +99,7 @@ def test_what_is_not_fitted_does_not_exist(ball: Asset) -> None:
         np.testing.assert_array_equal(image, before[name])
 
 
-@pytest.mark.parametrize("visibility", ["edges", "pairs"])
+@pytest.mark.parametrize("visibility", [CameraRays(), Pairs()], ids=["edges", "pairs"])
 def test_no_kernel_is_compiled_after_the_first_steps(ball: Asset, visibility: str) -> None:
     model, pool, validation = make_fit(ball)
     looks = (

@@ -25,6 +25,10 @@ from appearance_opt.optimize.losses import LOSSES, Target, compared_pixels, imag
 from appearance_opt.optimize.step import Gradients, StepInputs, first_non_finite, step
 from appearance_opt.reference.pool import Targets
 from appearance_opt.render import gradient
+from appearance_opt.render.boundary.camera_rays import CameraRays
+from appearance_opt.render.boundary.edges import Edges
+from appearance_opt.render.boundary.pairs import Pairs
+from appearance_opt.render.boundary.seen import Estimator
 from appearance_opt.render.images import render_image
 from appearance_opt.render.pixels import Batch, Grid
 from appearance_opt.render.quality import Quality
@@ -72,7 +76,7 @@ def make_inputs(model: Latent, grid: Grid, seed: int = 0) -> StepInputs:
 
 
 def test_texel_gradients_agree_with_finite_differences() -> None:
-    model, grid, quality = make_model(), Grid(2, 48), Quality(0.0, 1, 1)
+    model, grid, quality = make_model(), Grid(2, 48), Quality(visibility=CameraRays(()))
     inputs = make_inputs(model, grid)
     loss = LOSSES["l2"]
     _, grads = Gradients(model, grid, quality, loss, freeze=False)(inputs)
@@ -99,7 +103,7 @@ def test_texel_gradients_agree_with_finite_differences() -> None:
 
 @pytest.mark.parametrize("channel", ["red", "roughness", "metalness", "normal_x", "normal_y"])
 def test_each_channel_has_its_own_correct_gradient(channel: str) -> None:
-    model, grid, quality = make_model(), Grid(2, 48), Quality(0.0, 1, 1)
+    model, grid, quality = make_model(), Grid(2, 48), Quality(visibility=CameraRays(()))
     loss = LOSSES["log-srgb-l2"]
     texels, parameter = model.fitted(Texels), model.parameters[TEXELS]
     assert texels is not None
@@ -141,7 +145,9 @@ def coverage_derivative(density: float, samples: int) -> tuple[float, float]:
     positions = mi.Float(start)
     dr.enable_grad(positions)
     drawn, batch = drawn_of(model, positions), Batch(records, grid)
-    rendered = gradient.render(drawn, batch, Quality(density, samples, 1), 0)
+    rendered = gradient.render(
+        drawn, batch, Quality(visibility=CameraRays((Edges(density),), samples)), 0
+    )
     by_image = np.zeros((grid.pixels, 4), np.float32)
     by_image[:, 3] = 1
     gradient.backward(gradient.surrogate(rendered, drawn.shown, mi.Float(by_image.ravel())))
@@ -316,23 +322,23 @@ def test_a_mesh_out_of_sight_has_no_gradient_and_breaks_nothing() -> None:
 
 @pytest.mark.parametrize("want_loss", [True, False])
 @pytest.mark.parametrize(
-    ("samples", "visibility"), [(1, "edges"), (2, "edges"), (2, "none"), (4, "none")]
+    ("samples", "finders"), [(1, (Edges(),)), (2, (Edges(),)), (2, ()), (4, ())]
 )
 def test_pixels_shaded_with_their_loss_have_the_gradient_of_the_whole_image(
-    samples: int, visibility: str, want_loss: bool
+    samples: int, finders: tuple[Edges, ...], want_loss: bool
 ) -> None:
     """The shortcut for pixels of few samples against the path through the image. Without
     silhouettes some pixels are covered in part. The gradient is the same whether the value of the
     loss is wanted or not."""
     model, grid = make_model(), Grid(2, 48)
-    quality = Quality(1.0, 4, samples, sample_width=0.4, visibility=visibility)
+    quality = Quality(samples, 0.4, visibility=CameraRays(finders, 4))
     inputs = replace(make_inputs(model, grid, 1), want_loss=want_loss)
     loss = LOSSES["log-srgb-l1"]
     value, quick = Gradients(model, grid, quality, loss, freeze=False)(inputs)
     tracked = model.track(model.decode(model.values()))
     drawn = model.drawn(tracked)
     rendered = gradient.render(drawn, Batch(inputs.views.records(), grid), quality, inputs.seed)
-    assert rendered.deferred is None
+    assert rendered.seen.whole is None
     target = Target.of(inputs.reference.average, inputs.background)
     pixels = compared_pixels(rendered.image, target)
     whole, by_image = image_loss(loss, target, rendered.image, pixels, grid.pixels)
@@ -348,9 +354,9 @@ def test_pixels_shaded_with_their_loss_have_the_gradient_of_the_whole_image(
 
 
 @pytest.mark.parametrize(
-    ("levels", "visibility"), [((0,), "edges"), ((1, 2), "edges"), ((0,), "pairs")]
+    ("levels", "visibility"), [((0,), CameraRays()), ((1, 2), CameraRays()), ((0,), Pairs())]
 )
-def test_frozen_steps_equal_traced_ones(levels: tuple[int, ...], visibility: str) -> None:
+def test_frozen_steps_equal_traced_ones(levels: tuple[int, ...], visibility: Estimator) -> None:
     """Recorded kernels see what moves: vertices, texels, views, images, how many pixels are
     covered."""
     maps: dict = wavy_maps(32)

@@ -22,6 +22,9 @@ from appearance_opt.optimize.losses import LOSSES
 from appearance_opt.optimize.step import Gradients, StepInputs
 from appearance_opt.reference.mesh import MeshReference
 from appearance_opt.reference.pool import Targets
+from appearance_opt.render.boundary.camera_rays import CameraRays
+from appearance_opt.render.boundary.edges import Edges
+from appearance_opt.render.boundary.pairs import Pairs
 from appearance_opt.render.images import render_image
 from appearance_opt.render.pixels import Batch, Grid
 from appearance_opt.render.quality import Quality
@@ -58,7 +61,8 @@ def front(
     return look_at(np.array([[0, 0, distance]]), np.zeros(3), fov, np.array([light]), power)
 
 
-EDGES, PAIRS = Quality(2.0, 4, 1), Quality(visibility="pairs")
+EDGES = Quality(visibility=CameraRays((Edges(2.0),), 4))
+PAIRS = Quality(visibility=Pairs())
 
 
 def check(
@@ -322,7 +326,9 @@ def test_edges_whose_third_corner_lies_behind_the_camera_push_outwards() -> None
         1.0,
         1,
     )
-    _, grads = Gradients(model, grid, Quality(8.0, 4, 1), LOSSES["l1"], freeze=False)(inputs)
+    _, grads = Gradients(
+        model, grid, Quality(visibility=CameraRays((Edges(8.0),), 4)), LOSSES["l1"], freeze=False
+    )(inputs)
     g = np.array(grads[POSITIONS]).reshape(-1, 3)
     # the background is white and wrong: raising either end of the far edge (y up) must lower the
     # loss

@@ -19,7 +19,12 @@ from appearance_opt.latent.parameter import Rates
 from appearance_opt.latent.positions import POSITIONS
 from appearance_opt.optimize.losses import LOSSES
 from appearance_opt.optimize.step import Gradients
-from appearance_opt.render import gradient, silhouette_walk
+from appearance_opt.render import gradient
+from appearance_opt.render.boundary import walk
+from appearance_opt.render.boundary.camera_rays import CameraRays
+from appearance_opt.render.boundary.edges import EdgePoints, Edges
+from appearance_opt.render.boundary.intersections import Crossings, Intersections
+from appearance_opt.render.boundary.pairs import Pairs
 from appearance_opt.render.drawn import Drawn
 from appearance_opt.render.edge_list import edge_list, walkable
 from appearance_opt.render.gradient import RenderedBatch
@@ -36,7 +41,7 @@ from tests.drawing import drawn_of
 from tests.test_gradients import flat_maps, make_inputs, make_model
 
 SAMPLER = ViewSampler((0.0, 0.0, 0.0), 1.0, seed=5)
-PAIRS = Quality(visibility="pairs")
+PAIRS = Quality(visibility=Pairs())
 
 
 def white(mesh: LatentMesh) -> Latent:
@@ -110,11 +115,11 @@ def test_the_gradient_is_that_of_the_blended_image(
 
     def image() -> np.ndarray:
         batch, _, _ = render(model, views, grid, quality)
-        assert batch.edges is not None and batch.averaged is not None
-        assert (batch.intersections is None) == (balls == 1)
-        curve = batch.intersections
-        crossing = [] if curve is None else [curve.pixel, curve.inside.triangle]
-        seen = (batch.edges.edge, batch.edges.pixel, batch.averaged.pixel, *crossing)
+        edges, *curves = batch.seen.boundaries
+        assert isinstance(edges, EdgePoints) and batch.seen.averaged is not None
+        assert [type(c) for c in curves] == [Crossings] * (balls - 1)
+        crossing = [a for c in curves for a in (c.pixel, c.inside.triangle)]
+        seen = (edges.edge, edges.pixel, batch.seen.averaged.pixel, *crossing)
         met.append([np.array(a).tobytes() for a in seen])
         return np.array(batch.image).reshape(-1, 4)
 
@@ -156,10 +161,10 @@ def test_a_walk_finds_silhouettes_beyond_the_triangle_that_is_seen(
     """Why we walk: without, fine meshes lose most of their outline."""
     model, grid, views = white(ball(0)), Grid(2, 64), SAMPLER.draw(1, 2)
     every, _, _ = render(model, views, grid, PAIRS)
-    monkeypatch.setattr(silhouette_walk, "LONGEST", 1)
+    monkeypatch.setattr(walk, "LONGEST", 1)
     near, _, _ = render(model, views, grid, PAIRS)
-    assert every.edges is not None and near.edges is not None
-    assert dr.width(near.edges.edge) < 0.5 * dr.width(every.edges.edge)
+    found = [dr.width(batch.seen.boundaries[0].pixel) for batch in (every, near)]
+    assert found[1] < 0.5 * found[0]
 
 
 def test_faces_around_faces() -> None:
@@ -184,8 +189,8 @@ def test_a_step_with_pairs_agrees_with_one_with_edges() -> None:
     found = {}
     for name, quality in (
         ("pairs", replace(PAIRS, samples=16)),
-        ("edges", Quality(16.0, 64, 16)),
-        ("none", Quality(visibility="none", samples=16)),
+        ("edges", Quality(16, visibility=CameraRays((Edges(16.0),), 64))),
+        ("none", Quality(16, visibility=CameraRays(()))),
     ):
         _, grads = Gradients(model, grid, quality, LOSSES["l2"], freeze=False)(inputs)
         # along three translations and a scaling
@@ -205,11 +210,11 @@ def test_surfaces_that_run_into_each_other_move_their_meeting_curve() -> None:
     target, truth = differences_along(problem, fields, 64)
     ours = Ours(problem, target, "log-srgb-l1")
     error = {}
-    edges = Quality(8.0, 16, 4)
+    edges, both = (Edges(8.0),), (Edges(8.0), Intersections())
     qualities = {
         "pairs": replace(PAIRS, samples=4),
-        "edges": edges,
-        "both": replace(edges, intersections=True),
+        "edges": Quality(4, visibility=CameraRays(edges, 16)),
+        "both": Quality(4, visibility=CameraRays(both, 16)),
     }
     for name, quality in qualities.items():
         g = ours(quality, 0)
@@ -226,7 +231,7 @@ def test_pairs_that_see_nothing_are_no_pairs() -> None:
     )
     model, grid = white(away), Grid(2, 32)
     batch, _, _ = render(model, SAMPLER.draw(0, 2), grid, PAIRS)
-    assert batch.edges is None and batch.averaged is None
+    assert not batch.seen.boundaries and batch.seen.averaged is None
     assert not np.array(batch.image).any()
 
 
@@ -240,7 +245,5 @@ def test_only_what_is_chosen_is_prepared() -> None:
 
 
 def test_bad_qualities_are_refused() -> None:
-    with pytest.raises(ValueError, match="none of edges, pairs, none"):
-        Quality(visibility="magic")
     with pytest.raises(ValueError, match="square number of samples per pixel, not 3"):
-        Quality(samples=3, visibility="pairs")
+        Quality(3, visibility=Pairs())

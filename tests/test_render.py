@@ -15,11 +15,12 @@ from appearance_opt.initial.sphere import sphere
 from appearance_opt.latent.texels import TexelCodec
 from appearance_opt.placement import Placement
 from appearance_opt.reference.mesh import MeshReference
-from appearance_opt.render import rays, texture, upload
+from appearance_opt.render import rays, texture, texture_upload, upload
 from appearance_opt.render.math import angle_of
 from appearance_opt.render.passing import MISS
 from appearance_opt.render.pixels import Batch, Grid
-from appearance_opt.render.texture import CLAMP, MIRROR, REPEAT, Base, build_pyramid
+from appearance_opt.render.texture import CLAMP, MIRROR, REPEAT
+from appearance_opt.render.texture_upload import Base, build_pyramid
 from appearance_opt.views import ViewSampler, look_at
 from experiments import mitsuba_peer
 from experiments.accuracy.images import compare_asset
@@ -103,7 +104,7 @@ def test_pyramids_are_made_in_bands_as_in_one(monkeypatch: pytest.MonkeyPatch) -
             levels.append(np.array(level).reshape(-1, 4))
         wanted = np.concatenate(levels)
         for band in (1, 1 << 26):
-            monkeypatch.setattr(texture, "BAND_BYTES", band)
+            monkeypatch.setattr(texture_upload, "BAND_BYTES", band)
             made = build_pyramid([Base.of(base)], [REPEAT])
             np.testing.assert_allclose(np.array(made.texels).reshape(-1, 4), wanted, rtol=1e-6)
 

@@ -21,6 +21,9 @@ from appearance_opt.latent.positions import POSITIONS
 from appearance_opt.optimize.losses import LOSSES
 from appearance_opt.optimize.step import Gradients
 from appearance_opt.render import gradient
+from appearance_opt.render.boundary.camera_rays import CameraRays
+from appearance_opt.render.boundary.edges import Edges
+from appearance_opt.render.boundary.pairs import Pairs
 from appearance_opt.render.images import render_image
 from appearance_opt.render.pixels import Batch, Grid
 from appearance_opt.render.quality import Quality
@@ -66,9 +69,8 @@ def test_silhouettes_carry_the_derivative_of_the_area_that_is_seen_of_fronts(
     mesh, views, grid = make(), SAMPLER.draw(1, 8), Grid(8, 64)
     model = latent_of(mesh, flat_maps(16), frozenset(("shape",)), Rates())
     assert model.topology.culled is not None and model.topology.culled.all()
-    quality = (
-        Quality(4.0, 8, 1) if visibility == "edges" else Quality(visibility="pairs", samples=4)
-    )
+    edges = Quality(visibility=CameraRays((Edges(4.0),)))
+    quality = edges if visibility == "edges" else Quality(4, visibility=Pairs())
     weight = np.repeat(np.random.default_rng(0).uniform(0.5, 1.5, 8), 64 * 64)
     start = np.array(model.vertices())
     positions = mi.Float(start)

@@ -20,6 +20,7 @@ from appearance_opt.latent.texels import TEXELS
 from appearance_opt.optimize.losses import LOSSES
 from appearance_opt.optimize.step import Gradients
 from appearance_opt.reference.mesh import MeshReference
+from appearance_opt.render.boundary.camera_rays import CameraRays
 from appearance_opt.render.material import UNLIT
 from appearance_opt.render.pixels import Grid
 from appearance_opt.render.quality import Quality
@@ -96,7 +97,7 @@ def test_gradients_of_unlit_texels_agree_with_finite_differences() -> None:
     ).repeat(size, axis=0)
     maps = {"red": wave, "green": 1 - wave, "blue": wave.T.copy(), UNLIT: 1.0}
     model = latent_of(mesh, maps, frozenset({"material"}), Rates())
-    grid, quality, loss = Grid(2, 48), Quality(0.0, 1, 1), LOSSES["l2"]
+    grid, quality, loss = Grid(2, 48), Quality(visibility=CameraRays(())), LOSSES["l2"]
     inputs = make_inputs(model, grid)
     _, grads = Gradients(model, grid, quality, loss, freeze=False)(inputs)
     analytic = np.array(grads[TEXELS]).astype(np.float64)

@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     from appearance_opt.latent.mesh import LatentMesh
     from appearance_opt.latent.parameter import Parameter, Rates
     from appearance_opt.latent.parts import Guard, Part
+    from appearance_opt.render.edge_list import EdgeList
     from appearance_opt.render.passing import Scene
-    from appearance_opt.render.silhouette import EdgeList
     from appearance_opt.render.surface import Surface
 
     Values = dict[str, mi.Float]

@@ -75,7 +75,8 @@ class Gradients:
         laplacians: Mapping[int, Laplacian] | None = None,
         freeze: bool = True,
     ) -> None:
-        self.latent, self.grid, self.quality, self.loss = latent, grid, quality, loss
+        self.latent, self.grid, self.loss = latent, grid, loss
+        self.quality = replace(quality, defer=gradient.DEFERRED)
         self.laplacians = laplacians or {}
         self._edges = {p.level: latent.edges(p, quality.walks) for p in latent.poses}
         self._run: Run = (
@@ -93,12 +94,12 @@ class Gradients:
             surface = run(self._surface, pose, decoded)
         drawn = latent.drawn(decoded, surface, self.quality.walks)
         batch = Batch(inputs.views.records(), grid)
-        rendered = gradient.render(drawn, batch, self.quality, inputs.seed, run, defer=True)
+        rendered = gradient.render(drawn, batch, self.quality, inputs.seed, run)
         # Only averaged pixels have a gradient here. Of one ray per pixel these are the crossed
         # ones; of several rays also those that are covered in part without being crossed. The value
         # of the loss needs all pixels.
-        some = rendered.crossed
-        if inputs.want_loss or rendered.deferred is None or self.quality.samples > 1:
+        some = rendered.seen.crossed
+        if inputs.want_loss or rendered.seen.whole is None or self.quality.samples > 1:
             some = compared_pixels(rendered.image, target, rendered.complete())
         averaged, by_image = None, dr.zeros(mi.Float, 4 * grid.pixels)
         if some is not None and dr.width(some):

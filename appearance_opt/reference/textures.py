@@ -12,7 +12,8 @@ from appearance_opt.asset.alpha import coverage, kind_of
 from appearance_opt.asset.packing import EMISSION, resize
 from appearance_opt.render.layers import CHANNELS, Coverage
 from appearance_opt.render.material import COLORS, UNLIT, MaterialMaps, TexelLayer
-from appearance_opt.render.texture import CLAMP, MIRROR, REPEAT, Base, build_pyramid
+from appearance_opt.render.texture import CLAMP, MIRROR, REPEAT
+from appearance_opt.render.texture_upload import Base, build_pyramid
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

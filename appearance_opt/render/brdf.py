@@ -19,10 +19,10 @@ ROUGHNESS_FLOOR = 0.08
 light is smaller than a pixel and its gradient useless."""
 
 
-GRAZING_COSINE = 0.02
+GRAZING_COSINE = 0.02  # docs/trials.md: silhouettes
 """Masking takes no flatter angles of light and viewer than this. Where both graze the surface, the
-highlight goes to zero within a range of angles as narrow as that, which hardly any ray meets: with
-0.001, a ray that did had derivatives a hundred times as large as all others."""
+highlight goes to zero within a range of angles as narrow as that: the few rays that meet a narrower
+one have derivatives that drown all others."""
 
 
 @dataclass
@@ -54,7 +54,7 @@ def reflect(material: MaterialSample, n: mi.Vector3f, v: mi.Vector3f, l: mi.Vect
     nh = clamp(dr.dot(n, h), 0, 1)
     vh = clamp(dr.dot(v, h), 0, 1)
     # (n.h)^2 (alpha^2 - 1) + 1 with the sine from the cross product: near the mirror direction of
-    # smooth surfaces 1 - (n.h)^2 has lost its digits (1 % of the radiance at roughness 0.08)
+    # smooth surfaces 1 - (n.h)^2 has lost its digits
     denominator = dr.fma(dr.square(nh), alpha2, dr.squared_norm(dr.cross(n, h)))
     # of unit vectors it is never below alpha^2; n and h can be zero where normals cancel
     denominator = at_least(denominator, 0.5 * alpha2)

@@ -12,7 +12,7 @@ from appearance_opt.render import outlines, rays
 from appearance_opt.render.freezing import traced
 from appearance_opt.render.lattice import sub_pixel_offsets
 from appearance_opt.render.passing import MISS
-from appearance_opt.render.pixels import pixel_index
+from appearance_opt.render.pixels import add_colors, pixel_index
 from appearance_opt.render.shading import shade
 from appearance_opt.render.visibility import Visible, see_grid
 
@@ -168,9 +168,6 @@ def _accumulate(
     mode: dr.ReduceMode,
 ) -> mi.Float:
     some = shaded[0].keep(shaded[1])
-    color, weight = shade(shown, batch, some, footprint.width), footprint.weight
-    value = mi.ArrayXf([color.x * weight, color.y * weight, color.z * weight, weight])
-    out = mi.Float(image)
-    pixel = pixel_index(some, batch.grid.rows)
-    dr.scatter_reduce(dr.ReduceOp.Add, out, value, pixel, mode=mode)
+    color, out = shade(shown, batch, some, footprint.width), mi.Float(image)
+    add_colors(out, color, footprint.weight, pixel_index(some, batch.grid.rows), mode)
     return out

@@ -20,7 +20,7 @@ from appearance_opt.render.camera import camera_of, direction
 from appearance_opt.render.freezing import traced
 from appearance_opt.render.material import TexelLayer
 from appearance_opt.render.passing import MISS, meet
-from appearance_opt.render.pixels import pixel_index
+from appearance_opt.render.pixels import add_colors, pixel_index
 from appearance_opt.render.samples import Samples
 from appearance_opt.render.shading import shade
 from appearance_opt.render.surface import interpolate
@@ -107,7 +107,11 @@ class SeenThrough:
             dr.eval(seen, light)
             share = run(_kept_back, shown, batch, self.coverage, seen.samples, light, footprint)
             dr.eval(share)
-            image = _blend(image, shown, batch, seen.samples, share, footprint, run)
+            some = dr.compress(share > 0)  # only those are shaded that keep anything back
+            if dr.width(some):
+                layer = seen.samples, some, share
+                image = run(_accumulate, image, shown, batch, layer, footprint)
+                dr.eval(image)
             light = light - share
             left = dr.compress(light >= LEAST)
             if dr.width(left) == 0:
@@ -133,40 +137,21 @@ def _kept_back(
     return coverage.at(hit) * light
 
 
-def _blend(
-    image: mi.Float,
-    shown: Shown,
-    batch: Batch,
-    hits: Samples,
-    share: mi.Float,
-    footprint: Footprint,
-    run: Run,
-) -> mi.Float:
-    """The image with a layer of hits, one at most per pixel: only those are shaded that keep
-    anything back."""
-    index = dr.compress(share > 0)
-    if dr.width(index) == 0:
-        return image
-    image = run(_accumulate, image, shown, batch, (hits, index), share, footprint)
-    dr.eval(image)
-    return image
-
-
 def _accumulate(
     image: mi.Float,
     shown: Shown,
     batch: Batch,
-    shaded: tuple[Samples, mi.UInt32],
-    share: mi.Float,
+    layer: tuple[Samples, mi.UInt32, mi.Float],
     footprint: Footprint,
 ) -> mi.Float:
-    some = shaded[0].keep(shaded[1])
-    color = shade(shown, batch, some, footprint.width)
-    part = dr.gather(mi.Float, share, shaded[1]) * footprint.weight
-    out = mi.Float(image)
-    value = mi.ArrayXf([color.x * part, color.y * part, color.z * part, part])
+    """The image with a ``layer``, one sample at most per pixel: samples, the positions in their list
+    of those that count, and the share of their rays' light that each of the list keeps back."""
+    samples, index, share = layer
+    some = samples.keep(index)
+    color, out = shade(shown, batch, some, footprint.width), mi.Float(image)
+    part = dr.gather(mi.Float, share, index) * footprint.weight
     pixel = pixel_index(some, batch.grid.rows)
-    dr.scatter_reduce(dr.ReduceOp.Add, out, value, pixel, mode=dr.ReduceMode.NoConflicts)
+    add_colors(out, color, part, pixel, dr.ReduceMode.NoConflicts)
     return out
 
 

@@ -87,6 +87,15 @@ def pixel_grid(views: int, resolution: int) -> tuple[mi.UInt32, mi.UInt32, mi.UI
     )
 
 
+def add_colors(
+    image: mi.Float, color: mi.Color3f, weight: mi.Float, pixel: mi.UInt32, mode: dr.ReduceMode
+) -> None:
+    """Add radiance and coverage of samples to an image (pixels * 4), in place: each ``weight`` of
+    its pixel."""
+    value = mi.ArrayXf([color.x * weight, color.y * weight, color.z * weight, weight])
+    dr.scatter_reduce(dr.ReduceOp.Add, image, value, pixel, mode=mode)
+
+
 def pixel_index(samples: Samples, resolution: mi.UInt32) -> mi.UInt32:
     """Index of the pixel of each sample in the batch: (view, row, column), row major."""
     column, row = mi.UInt32(samples.x), mi.UInt32(samples.y)

@@ -77,8 +77,8 @@ def interpolate(
     ``width``: width of a sample in pixels. The normal is turned towards the viewer when the back of
     the triangle is seen.
     """
-    face, rows = _triangle(surface, samples.triangle)
-    p = [mi.Point3f(r[0], r[1], r[2]) for r in rows]
+    triangle = _gather(surface, samples.triangle)
+    p = triangle.positions
     e1, e2 = p[1] - p[0], p[2] - p[0]
     d = direction(camera, samples.x, samples.y, resolution)
     q = dr.cross(d, e2)
@@ -99,10 +99,10 @@ def interpolate(
         b1, b2 = (dr.detach(x) + share * (x - dr.detach(x)) for x in (b1, b2))
     # from the corners, not along the ray: that is within the triangle whatever became of the depth
     position = dr.fma(e1, b1, dr.fma(e2, b2, p[0]))
-    hit = Hit(position, mi.Vector3f(0), d / -length, face[3])
+    hit = Hit(position, mi.Vector3f(0), d / -length, triangle.face[3])
     pixel = depth * (2 * width / resolution) * dr.norm(camera.right)
     area = dr.square(pixel) / at_least(dr.abs(cosine), GRAZING_COSINE)
-    _attributes(hit, surface, samples.triangle, face, rows, b1, b2, facing, area)
+    _attributes(hit, surface, triangle, (b1, b2), facing, area)
     # the back of a triangle is seen: turning the normal over also turns the bitangent, which the
     # sign of the handedness undoes
     back = cosine > 0
@@ -117,12 +117,12 @@ def interpolate_at(
 ) -> Hit:
     """Attributes at barycentric points of triangles, seen from outside; ``area`` of the patch that
     a point stands for, in world units squared. ``to_viewer`` is zero."""
-    face, rows = _triangle(surface, triangle)
-    p = [mi.Point3f(r[0], r[1], r[2]) for r in rows]
+    here = _gather(surface, triangle)
+    p = here.positions
     facing = dr.cross(p[1] - p[0], p[2] - p[0])
     position = p[0] * (1 - b1 - b2) + p[1] * b1 + p[2] * b2
-    hit = Hit(position, mi.Vector3f(0), mi.Vector3f(0), face[3])
-    _attributes(hit, surface, triangle, face, rows, b1, b2, facing, area)
+    hit = Hit(position, mi.Vector3f(0), mi.Vector3f(0), here.face[3])
+    _attributes(hit, surface, here, (b1, b2), facing, area)
     return hit
 
 
@@ -144,19 +144,29 @@ def vertex_position(surface: Surface, index: mi.UInt32) -> mi.Point3f:
     return mi.Point3f(v[0], v[1], v[2])
 
 
-def _triangle(surface: Surface, triangle: mi.UInt32) -> tuple[mi.ArrayXu, list]:
+@dataclass
+class _Triangle:
+    """Triangles of the numbers ``index``: packets of their ``face`` and of their three vertices."""
+
+    index: mi.UInt32
+    face: mi.ArrayXu
+    vertices: list
+
+    @property
+    def positions(self) -> list:
+        return [mi.Point3f(v[0], v[1], v[2]) for v in self.vertices]
+
+
+def _gather(surface: Surface, triangle: mi.UInt32) -> _Triangle:
     face = dr.gather(mi.ArrayXu, surface.faces, triangle, shape=(4, dr.width(triangle)))
-    return face, [_packet(surface.vertices, face[k], 8) for k in range(3)]
+    return _Triangle(triangle, face, [_packet(surface.vertices, face[k], 8) for k in range(3)])
 
 
 def _attributes(
     hit: Hit,
     surface: Surface,
-    triangle: mi.UInt32,
-    face: mi.ArrayXu,
-    rows: list,
-    b1: mi.Float,
-    b2: mi.Float,
+    triangle: _Triangle,
+    barycentric: tuple[mi.Float, mi.Float],
     facing: mi.Vector3f,
     area: mi.Float,
 ) -> None:
@@ -164,12 +174,13 @@ def _attributes(
     colours, texture coordinates and tangents. ``facing``: normal of the triangle by its winding,
     twice its area long; it is taken where vertices have no normal. ``area`` of a sample on the
     surface becomes its UV footprint."""
+    (b1, b2), face = barycentric, triangle.face
     b0 = 1 - b1 - b2
 
     def mix(values: list) -> mi.Float:
         return dr.fma(values[0], b0, dr.fma(values[1], b1, values[2] * b2))
 
-    normal = unit(mi.Vector3f(*(mix([v[c] for v in rows]) for c in (4, 5, 6))))
+    normal = unit(mi.Vector3f(*(mix([v[c] for v in triangle.vertices]) for c in (4, 5, 6))))
     hit.normal = dr.select(dr.squared_norm(normal) > 0, normal, unit(dr.detach(facing)))
     if surface.colors is not None:
         c = [_packet(surface.colors, face[k], 4) for k in range(3)]
@@ -179,7 +190,8 @@ def _attributes(
         return
     corner = face
     if surface.corners is not None:
-        corner = dr.gather(mi.ArrayXu, surface.corners, triangle, shape=(4, dr.width(triangle)))
+        shape = (4, dr.width(triangle.index))
+        corner = dr.gather(mi.ArrayXu, surface.corners, triangle.index, shape=shape)
     f = [_packet(surface.frames, corner[k], 8 if surface.has_tangents else 2) for k in range(3)]
     hit.uv = mi.Point2f(mix([v[0] for v in f]), mix([v[1] for v in f]))
     a, b = (dr.detach(mi.Point2f(f[k][0] - f[0][0], f[k][1] - f[0][1])) for k in (1, 2))

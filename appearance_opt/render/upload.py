@@ -94,8 +94,8 @@ class MovingScene:
     """The ``scene`` of one triangle mesh that moves. ``culled``: as in ``scene_of``.
 
     On the CPU it is an instance of the mesh: Mitsuba asks Embree for the best BVH of a scene's own
-    shapes, which splits triangles and takes two to four times as long as the plain one that it asks
-    for what is instanced. Rays take longer, by up to two thirds.
+    shapes, which splits triangles and takes longer to build than the plain one that it asks for
+    what is instanced (docs/trials.md: kernels).
     """
 
     def __init__(self, positions: NDArray, faces: NDArray, culled: NDArray | None = None) -> None:

@@ -19,6 +19,7 @@ from appearance_opt.optimize.observers import Observer, Reporter, Stop
 from appearance_opt.optimize.plan import FitOptions
 from appearance_opt.optimize.validation import Validation
 from appearance_opt.reference.pool import ReferencePool
+from appearance_opt.render.boundary.camera_rays import CameraRays
 from appearance_opt.render.quality import Quality
 from appearance_opt.views import VALIDATION
 
@@ -156,7 +157,7 @@ def fit_policy(
     by fitting; ``patience``: see there.
     """
     if not likeness:
-        return Quality(1.0, 4, 1), Rates(0.05, 0.01, 0.02, 0.01, 0.05)
+        return Quality(visibility=CameraRays(samples=4)), Rates(0.05, 0.01, 0.02, 0.01, 0.05)
     rate = 0.008 * float(np.clip(10 ** ((25.0 - psnr) / 10.0), 0.25, 3.5))
     still = float(np.clip(10 ** ((34.0 - psnr) / 3.0), LEAST_VERTEX_SHARE, 1.0)) ** patience
     rate *= float(np.clip(10 ** ((35.0 - psnr) / 4.0), LEAST_RATE_SHARE, 1.0)) ** patience

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from appearance_opt.initial.sphere import sphere
 from appearance_opt.latent import mesh_ops
 from appearance_opt.optimize import losses
-from appearance_opt.render import brdf, camera, coverage, surface
+from appearance_opt.render import brdf, camera, surface
+from appearance_opt.render.boundary import coverage
 from experiments.accuracy.double import double_arrays, in_double
 
 COUNT = 200_000

@@ -9,7 +9,8 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from appearance_opt.render.texture import CLAMP, MIRROR, REPEAT, Base, Pyramid, build_pyramid
+from appearance_opt.render.texture import CLAMP, MIRROR, REPEAT, Pyramid
+from appearance_opt.render.texture_upload import Base, build_pyramid
 
 LOOKUPS = 2000
 WRAPS = {"clamp": CLAMP, "periodic": REPEAT, "mirror": MIRROR}

@@ -9,24 +9,28 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from appearance_opt import backend
-from appearance_opt.latent.latent import Decoded
 from appearance_opt.latent.positions import POSITIONS
 from appearance_opt.latent.texels import TEXELS, Texels
 from appearance_opt.optimize import adam
 from appearance_opt.optimize.losses import LOSSES, Target, compared_pixels, covered_loss, image_loss
 from appearance_opt.render import gradient
+from appearance_opt.render.boundary.camera_rays import CameraRays
 from appearance_opt.render.drawn import Shown
 from appearance_opt.render.freezing import Frozen
 from appearance_opt.render.pixels import Batch, Grid
 from appearance_opt.render.quality import Quality
 from appearance_opt.stages.fitting import point_width
 from experiments.bench.scene import set_up
+
+if TYPE_CHECKING:
+    from appearance_opt.latent.latent import Decoded
 
 REPEATS = 15
 
@@ -63,7 +67,10 @@ class Stopwatch:
 def stages(resolution: int, maps: int) -> dict[str, float]:
     """Median milliseconds of each stage."""
     source, model, sampler = set_up(3000, 100_000, maps)
-    grid, quality = Grid(4, resolution), Quality(point_width=point_width(resolution, maps))
+    grid, quality = (
+        Grid(4, resolution),
+        Quality(point_width=point_width(resolution, maps), defer=gradient.DEFERRED),
+    )
     batch = Batch(sampler.draw(0, 4).records(), grid)
     reference = source.render_device(batch, 1)
     stopwatch = Stopwatch()
@@ -89,9 +96,12 @@ def stages(resolution: int, maps: int) -> dict[str, float]:
     run = Frozen(model.fixed(), grid)
 
     def forward(quality: Quality) -> gradient.RenderedBatch:
-        return gradient.render(drawn, batch, quality, 0, run, defer=True)
+        return gradient.render(drawn, batch, quality, 0, run)
 
-    timed("visibility alone", lambda: forward(Quality(0.0, 1, 1)).image)
+    timed(
+        "visibility alone",
+        lambda: forward(Quality(defer=gradient.DEFERRED, visibility=CameraRays(()))).image,
+    )
     timed("visibility, silhouettes, averaged pixels", lambda: forward(quality).image)
     rendered = forward(quality)
 

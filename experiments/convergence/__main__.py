@@ -20,18 +20,21 @@ from pathlib import Path
 
 from appearance_opt import backend
 from appearance_opt.optimize.loop import fit
+from appearance_opt.render.boundary.camera_rays import CameraRays
+from appearance_opt.render.boundary.edges import Edges
+from appearance_opt.render.boundary.pairs import Pairs
 from appearance_opt.render.quality import Quality
 from experiments.convergence.cases import Case, make_case, names, source
 from experiments.convergence.plot import draw
 
 OUT = Path("out/convergence")
 ESTIMATORS = {
-    "none": Quality(visibility="none"),
-    "edges 1, 4 rays": Quality(1.0, 4),
-    "edges 1, 8 rays": Quality(1.0, 8),
-    "edges 4, 8 rays": Quality(4.0, 8),
-    "pairs": Quality(visibility="pairs"),
-    "pairs, 2 x 2": Quality(samples=4, visibility="pairs"),
+    "none": Quality(visibility=CameraRays(())),
+    "edges 1, 4 rays": Quality(visibility=CameraRays(samples=4)),
+    "edges 1, 8 rays": Quality(),
+    "edges 4, 8 rays": Quality(visibility=CameraRays((Edges(4.0),))),
+    "pairs": Quality(visibility=Pairs()),
+    "pairs, 2 x 2": Quality(4, visibility=Pairs()),
 }
 FIELDS = ("case", "estimator", "seed", "budget", "seconds", "step", "psnr")
 LOOK = 1 / 12

@@ -24,6 +24,11 @@ import drjit as dr
 import numpy as np
 
 from appearance_opt import backend
+from appearance_opt.render.boundary.camera_rays import CameraRays
+from appearance_opt.render.boundary.edges import Edges
+from appearance_opt.render.boundary.intersections import Intersections
+from appearance_opt.render.boundary.pairs import Pairs
+from appearance_opt.render.boundary.seen import Finder
 from appearance_opt.render.quality import Quality
 from experiments import mitsuba_peer
 from experiments.gradient_error.estimators import Ours
@@ -36,21 +41,27 @@ from experiments.gradient_error.reference import Truth, truth
 OUT = Path("out/gradient_error")
 REPEATS, TIMED = 6, 8
 
+
+def at_edges(density: float, rays: int, samples: int = 1, *others: Finder) -> Quality:
+    """Points at silhouettes, and what ``others`` find."""
+    return Quality(samples, visibility=CameraRays((Edges(density), *others), rays))
+
+
 SETTINGS = {
-    "none": Quality(visibility="none"),
-    "pairs": Quality(visibility="pairs"),
-    "pairs, 2 x 2": Quality(samples=4, visibility="pairs"),
-    "pairs, 4 x 4": Quality(samples=16, visibility="pairs"),
-    "edges 1, 4 rays": Quality(1.0, 4, 1),
+    "none": Quality(visibility=CameraRays(())),
+    "pairs": Quality(visibility=Pairs()),
+    "pairs, 2 x 2": Quality(4, visibility=Pairs()),
+    "pairs, 4 x 4": Quality(16, visibility=Pairs()),
+    "edges 1, 4 rays": at_edges(1.0, 4),
     "edges 1, 8 rays (default)": Quality(),
-    "edges 2, 4 rays": Quality(2.0, 4, 1),
-    "edges 4, 8 rays": Quality(4.0, 8, 1),
-    "edges 4, 8 rays, intersections": Quality(4.0, 8, 1, intersections=True),
-    "edges 8, 16 rays, 2": Quality(8.0, 16, 2),
-    "edges 8, 16 rays, 2, intersections": Quality(8.0, 16, 2, intersections=True),
-    "edges 8, 16 rays, 2 x 2": Quality(8.0, 16, 4),
-    "edges 8, 16 rays, 2 x 2, intersections": Quality(8.0, 16, 4, intersections=True),
-    "edges 16, 64 rays, 4 x 4": Quality(16.0, 64, 16),
+    "edges 2, 4 rays": at_edges(2.0, 4),
+    "edges 4, 8 rays": at_edges(4.0, 8),
+    "edges 4, 8 rays, intersections": at_edges(4.0, 8, 1, Intersections()),
+    "edges 8, 16 rays, 2": at_edges(8.0, 16, 2),
+    "edges 8, 16 rays, 2, intersections": at_edges(8.0, 16, 2, Intersections()),
+    "edges 8, 16 rays, 2 x 2": at_edges(8.0, 16, 4),
+    "edges 8, 16 rays, 2 x 2, intersections": at_edges(8.0, 16, 4, Intersections()),
+    "edges 16, 64 rays, 4 x 4": at_edges(16.0, 64, 16),
 }
 """Edges: silhouette points per pixel of silhouette, rays per pixel that a silhouette crosses, rays
 in the others (one where nothing is said)."""

@@ -23,7 +23,11 @@ from appearance_opt.latent.latent import Latent
 from appearance_opt.latent.mesh import LatentMesh
 from appearance_opt.latent.parameter import Rates
 from appearance_opt.latent.positions import POSITIONS
-from appearance_opt.render import gradient, silhouette, silhouette_walk
+from appearance_opt.render import gradient
+from appearance_opt.render.boundary import edges, walk
+from appearance_opt.render.boundary.camera_rays import CameraRays
+from appearance_opt.render.boundary.edges import Edges
+from appearance_opt.render.boundary.pairs import Pairs
 from appearance_opt.render.images import render_image
 from appearance_opt.render.pixels import Batch, Grid
 from appearance_opt.render.quality import Quality
@@ -31,14 +35,15 @@ from appearance_opt.views import ViewSampler
 from experiments.gradient_error.problems import split
 
 RESOLUTION, RADIUS, STEP = 64, 0.7, 0.02
-EDGES, PAIRS = Quality(4.0, 8), Quality(visibility="pairs")
+EDGES = Quality(visibility=CameraRays((Edges(4.0),)))
+PAIRS = Quality(visibility=Pairs())
 SETTINGS: dict[str, tuple[Quality, tuple]] = {
     "edges 4, 8 rays": (EDGES, ()),
-    "the same, side rays at 1e-3 pixels": (EDGES, (silhouette, "OFFSET", 1e-3 / RESOLUTION)),
-    "the same, side rays at 1e-2 pixels": (EDGES, (silhouette, "OFFSET", 1e-2 / RESOLUTION)),
+    "the same, side rays at 1e-3 pixels": (EDGES, (edges, "OFFSET", 1e-3 / RESOLUTION)),
+    "the same, side rays at 1e-2 pixels": (EDGES, (edges, "OFFSET", 1e-2 / RESOLUTION)),
     "pairs": (PAIRS, ()),
-    "pairs without a walk": (PAIRS, (silhouette_walk, "LONGEST", 1)),
-    "pairs, 2 x 2": (Quality(samples=4, visibility="pairs"), ()),
+    "pairs without a walk": (PAIRS, (walk, "LONGEST", 1)),
+    "pairs, 2 x 2": (Quality(4, visibility=Pairs()), ()),
 }
 
 

@@ -24,6 +24,8 @@ from appearance_opt.latent.texels import TEXELS, TexelCodec, Texels
 from appearance_opt.optimize.losses import LOSSES
 from appearance_opt.optimize.step import Gradients, StepInputs
 from appearance_opt.reference.pool import Targets
+from appearance_opt.render.boundary.camera_rays import CameraRays
+from appearance_opt.render.boundary.edges import Edges
 from appearance_opt.render.images import render_image
 from appearance_opt.render.pixels import Batch, Grid
 from appearance_opt.render.quality import Quality
@@ -39,9 +41,9 @@ SCENES = {
     "minified, 512² texels on 64² pixels": (512, 64),
 }
 SETTINGS = {
-    "1 sample": Quality(1.0, 4, 1),
-    "4 samples": Quality(4.0, 8, 4, sample_width=1.0),
-    "16 samples": Quality(8.0, 16, 16, sample_width=1.0),
+    "1 sample": Quality(visibility=CameraRays(samples=4)),
+    "4 samples": Quality(4, visibility=CameraRays((Edges(4.0),))),
+    "16 samples": Quality(16, visibility=CameraRays((Edges(8.0),), 16)),
 }
 
 

@@ -9,6 +9,8 @@ from appearance_opt.config import simplify_options
 from appearance_opt.latent.parameter import Rates
 from appearance_opt.optimize.plan import FitOptions
 from appearance_opt.options.views import ViewOptions
+from appearance_opt.render.boundary.camera_rays import CameraRays
+from appearance_opt.render.boundary.edges import Edges
 from appearance_opt.render.quality import Quality
 from appearance_opt.stages import fitting, growth
 
@@ -108,7 +110,8 @@ def _texture(factor: float) -> Callable[[Setup], Setup]:
 
 
 def _quality(density: float, rays: int) -> Callable[[Setup], Setup]:
-    return lambda s: replace(s, quality=Quality(density, rays))
+    visibility = CameraRays((Edges(density),) if density else (), rays)
+    return lambda s: replace(s, quality=Quality(visibility=visibility))
 
 
 def _reuse(times: int) -> Callable[[Setup], Setup]:

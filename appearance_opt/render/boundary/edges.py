@@ -1,4 +1,4 @@
-"""The derivative of visibility: explicit silhouette edges.
+"""Silhouette edges: the usual boundaries.
 
 Where a silhouette of the mesh moves across a pixel, the pixel changes although no shaded sample
 does. Differentiating the pixel's integral over its area gives, besides the interior term that
@@ -22,27 +22,31 @@ import drjit as dr
 import mitsuba as mi
 
 from appearance_opt.render import rays
+from appearance_opt.render.boundary import coverage
+from appearance_opt.render.boundary.silhouettes import (
+    edges_of,
+    gather_edges,
+    is_silhouette,
+    seen_opposite,
+)
 from appearance_opt.render.camera import camera_of, project
-from appearance_opt.render.edge_list import EdgeList
 from appearance_opt.render.freezing import traced
 from appearance_opt.render.samples import Samples
 from appearance_opt.render.surface import vertex_position
 
 if TYPE_CHECKING:
-    from appearance_opt.render.camera import Camera
     from appearance_opt.render.drawn import Drawn, Shown
     from appearance_opt.render.freezing import Run
-    from appearance_opt.render.pixels import Batch
+    from appearance_opt.render.pixels import Batch, Grid
+    from appearance_opt.render.sampling import Sampling
 
-OFFSET = 1e-6
+OFFSET = 1e-6  # docs/trials.md: silhouettes
 """Distance of the two rays from the edge, in widths of the image: eight times the rounding of a
-ray's direction. Fine meshes have folds thinner than a thousandth of a pixel beside their outline,
-which farther rays count twice (the area of a sphere of 20,000 triangles on 64 squared pixels: 5.6 %
-too much at 1e-3 pixels, 16 % at 1e-2)."""
+ray's direction. Farther rays count folds twice that are thinner than this beside an outline."""
 
-DEPTH_SLACK = 0.01
+DEPTH_SLACK = 0.01  # docs/trials.md: silhouettes
 """A hit nearer than the edge's own depth by more than this fraction hides the edge. Smaller values
-reject edges of grazing faces (0.002 costs 4 % bias)."""
+reject edges of grazing faces."""
 
 MAX_SAMPLES = 1 << 20
 """Silhouette points of a batch before they are tested for visibility; of longer silhouettes they
@@ -50,13 +54,13 @@ lie farther apart, and each stands for more."""
 
 
 @dataclass
-class EdgeSamples:
+class EdgePoints:
     """V visible points on projected silhouettes.
 
     ``edge``: index; ``view``; ``position``: parameter along the projected edge in [0, 1];
     ``pixel``: index into the batch; ``length``: share of the projected silhouette length that the
     point stands for, in pixels, one number for all or one for each; ``normal_x``, ``normal_y``: its
-    outward normal in the image; ``inside``, ``outside``: what is seen on the two sides.
+    outward normal in the image; the rest: see ``Boundary``.
     """
 
     edge: mi.UInt32
@@ -68,14 +72,46 @@ class EdgeSamples:
     normal_y: mi.Float
     inside: Samples
     outside: Samples
+    contrast: mi.ArrayXf | None = None
 
-    def keep(self, index: mi.UInt32) -> EdgeSamples:
+    @property
+    def measure(self) -> mi.Float:
+        """See ``Boundary``."""
+        return self.length
+
+    def motion(self, shown: Shown, batch: Batch) -> mi.Float:
+        """See ``Boundary``: n . x(theta), the position of each point along its outward normal in
+        pixels."""
+        edge, camera = gather_edges(shown, self.edge), camera_of(batch.records, self.view)
+        ax, ay, _ = project(camera, edge.a, batch.grid.size)
+        bx, by, _ = project(camera, edge.b, batch.grid.size)
+        x, y = dr.lerp(ax, bx, self.position), dr.lerp(ay, by, self.position)
+        return dr.fma(self.normal_x, x, self.normal_y * y)
+
+    def corrected(self, image: mi.Float, rays: int, grid: Grid) -> mi.Float:
+        """See ``Boundary``: the points know the line that bounds what is covered."""
+        row = self.pixel // grid.rows
+        column = self.pixel - row * grid.rows
+        row -= (row // grid.rows) * grid.rows
+        x = self.inside.x - mi.Float(column) - 0.5
+        y = self.inside.y - mi.Float(row) - 0.5
+        nx, ny = self.normal_x, self.normal_y
+        missed = coverage.missed_area(nx, ny, dr.fma(nx, x, ny * y), rays)
+        # several points of one line: their mean
+        count = dr.zeros(mi.UInt32, grid.pixels)
+        dr.scatter_reduce(dr.ReduceOp.Add, count, mi.UInt32(1), self.pixel)
+        missed /= mi.Float(dr.gather(mi.UInt32, count, self.pixel))
+        out = dr.zeros(mi.Float, grid.pixels * 4)
+        dr.scatter_reduce(dr.ReduceOp.Add, out, self.contrast * missed, self.pixel)
+        return coverage.add_missed(image, out)
+
+    def keep(self, index: mi.UInt32) -> EdgePoints:
         """The points at the given places of the list."""
 
         def pick(v: mi.Float | mi.UInt32) -> mi.Float | mi.UInt32:
             return dr.gather(type(v), v, index)
 
-        return EdgeSamples(
+        return EdgePoints(
             pick(self.edge),
             pick(self.view),
             pick(self.position),
@@ -88,29 +124,39 @@ class EdgeSamples:
         )
 
 
-@dataclass
-class GatheredEdges:
-    """Edges of what is drawn: their numbers ``index`` and packets ``corners`` (see ``EdgeList``),
-    and their ends ``a`` and ``b``."""
+@dataclass(frozen=True)
+class Edges:
+    """A ``Finder`` of silhouettes: about ``density`` points per pixel of their projected length."""
 
-    index: mi.UInt32
-    corners: mi.ArrayXu
-    a: mi.Point3f
-    b: mi.Point3f
+    density: float = 1.0
 
+    @property
+    def walks(self) -> bool:
+        return False
 
-def gather_edges(shown: Shown, index: mi.UInt32, active: mi.Bool | bool = True) -> GatheredEdges:
-    """The edges of the given numbers; differentiable in the vertices."""
-    edges = edges_of(shown)
-    corners = dr.gather(mi.ArrayXu, edges.packets, index, active, shape=(4, dr.width(index)))
-    a, b = (vertex_position(shown.surface, corners[k]) for k in (0, 1))
-    return GatheredEdges(index, corners, a, b)
-
-
-def edges_of(shown: Shown | Drawn) -> EdgeList:
-    """The edges of what is drawn, which must have some."""
-    assert shown.edges is not None, "silhouettes need the edges of what is drawn"
-    return shown.edges
+    def find(
+        self, drawn: Drawn, batch: Batch, sampling: Sampling, seed: int, run: Run = traced
+    ) -> EdgePoints | None:
+        """See ``Finder``: visible points, stratified along the total length; ``seed`` moves them
+        within their strata."""
+        index, length = silhouette_edges(drawn, batch, run)
+        if dr.width(index) == 0:
+            return None
+        # in single precision the rounding of sums of 1e5 pixels is a tenth of an edge of a fine mesh
+        upper = dr.cumsum(mi.Float64(length))
+        total = float(upper[dr.width(upper) - 1])
+        count = min(max(int(total * self.density), 1), MAX_SAMPLES)
+        number = dr.arange(mi.UInt32, count)
+        dr.eval(number)
+        strata = Strata(
+            index,
+            upper,
+            dr.opaque(mi.UInt32, dr.width(upper) - 1),
+            dr.opaque(mi.Float64, total / count),
+        )
+        points, visible = run(_points, drawn, batch, strata, number, dr.opaque(mi.UInt32, seed))
+        kept = dr.compress(visible)
+        return points.keep(kept) if dr.width(kept) else None
 
 
 def silhouette_edges(drawn: Drawn, batch: Batch, run: Run = traced) -> tuple[mi.UInt32, mi.Float]:
@@ -139,55 +185,6 @@ def _candidates(shown: Shown, batch: Batch) -> tuple[mi.Bool, mi.Float]:
     return visible, length
 
 
-def is_silhouette(shown: Shown, edge: GatheredEdges, camera: Camera) -> mi.Bool:
-    """Do both faces of edges lie on one side of the plane through eye and edge? No winding is
-    needed, but for culled faces: what turns its back to the eye is not there."""
-    m = dr.cross(edge.a - camera.eye, edge.b - edge.a)
-    side, other_side = (
-        dr.dot(m, vertex_position(shown.surface, edge.corners[k]) - edge.a) for k in (2, 3)
-    )
-    boundary = edge.corners[3] == edge.corners[1]
-    out = boundary | (side * other_side > 0)
-    sides = edges_of(shown).sides
-    if sides is None:
-        return out
-    bits = dr.gather(mi.UInt32, sides, edge.index)
-    gone, other_gone = _turned_away(bits, side), boundary | _turned_away(bits >> 2, other_side)
-    return (out | (gone != other_gone)) & ~(gone & other_gone)
-
-
-def _turned_away(bits: mi.UInt32, side: mi.Float) -> mi.Bool:
-    """Does a culled face turn its back to the eye? ``bits`` of ``EdgeList.sides``; ``side``:
-    product of its opposite vertex, from the edge on, and the normal of the plane through eye and
-    edge."""
-    return ((bits & 1) != 0) & (dr.select((bits & 2) != 0, side, -side) > 0)
-
-
-def sample_edges(
-    drawn: Drawn, batch: Batch, density: float, seed: int, run: Run = traced
-) -> EdgeSamples | None:
-    """Visible silhouette points, about ``density`` per pixel of projected length; None if there are
-    none. Stratified along the total length; ``seed`` moves the points within their strata."""
-    index, length = silhouette_edges(drawn, batch, run)
-    if dr.width(index) == 0:
-        return None
-    # in single precision the rounding of sums of 1e5 pixels is a tenth of an edge of a fine mesh
-    upper = dr.cumsum(mi.Float64(length))
-    total = float(upper[dr.width(upper) - 1])
-    count = min(max(int(total * density), 1), MAX_SAMPLES)
-    number = dr.arange(mi.UInt32, count)
-    dr.eval(number)
-    strata = Strata(
-        index,
-        upper,
-        dr.opaque(mi.UInt32, dr.width(upper) - 1),
-        dr.opaque(mi.Float64, total / count),
-    )
-    points, visible = run(_points, drawn, batch, strata, number, dr.opaque(mi.UInt32, seed))
-    kept = dr.compress(visible)
-    return points.keep(kept) if dr.width(kept) else None
-
-
 @dataclass
 class Strata:
     """Silhouettes in a row: ``index`` of each (view * edges + edge), the length ``upper`` up to its
@@ -201,7 +198,7 @@ class Strata:
 
 def _points(
     drawn: Drawn, batch: Batch, strata: Strata, number: mi.UInt32, seed: mi.UInt32
-) -> tuple[EdgeSamples, mi.Bool]:
+) -> tuple[EdgePoints, mi.Bool]:
     """The points of the given numbers along the silhouettes, and whether each is visible."""
     shown, size, rows = drawn.shown, batch.grid.size, batch.grid.rows
     count = edges_of(shown).count
@@ -216,7 +213,7 @@ def _points(
     camera = camera_of(batch.records, view)
     ax, ay, az = project(camera, edge.a, size)
     bx, by, bz = project(camera, edge.b, size)
-    opposite = _seen_opposite(shown, edge, camera)
+    opposite = seen_opposite(shown, edge, camera)
     ox, oy, oz = project(camera, vertex_position(shown.surface, opposite), size)
     nx, ny = ay - by, bx - ax
     scale = dr.rsqrt(dr.fma(nx, nx, ny * ny))
@@ -238,20 +235,9 @@ def _points(
     # an edge with the same face (or nothing) on both sides has no contrast
     visible &= hits[0].triangle != hits[1].triangle
     pixel = (view * rows + mi.UInt32(y)) * rows + mi.UInt32(x)
-    return EdgeSamples(
+    return EdgePoints(
         edge.index, view, s, pixel, mi.Float(strata.spacing), nx, ny, hits[0], hits[1]
     ), visible
-
-
-def _seen_opposite(shown: Shown, edge: GatheredEdges, camera: Camera) -> mi.UInt32:
-    """The opposite vertex of a face of each silhouette that is not culled."""
-    sides = edges_of(shown).sides
-    if sides is None:
-        return edge.corners[2]
-    m = dr.cross(edge.a - camera.eye, edge.b - edge.a)
-    side = dr.dot(m, vertex_position(shown.surface, edge.corners[2]) - edge.a)
-    away = _turned_away(dr.gather(mi.UInt32, sides, edge.index), side)
-    return dr.select(away, edge.corners[3], edge.corners[2])
 
 
 def _first_not_below(
@@ -267,13 +253,3 @@ def _first_not_below(
         below = dr.gather(mi.Float64, ascending, candidate - 1, inside) < value
         found = dr.select(inside & below, candidate, found)
     return found
-
-
-def motion(shown: Shown, batch: Batch, samples: EdgeSamples) -> mi.Float:
-    """n . x(theta): the position of each point along its outward normal in pixels, differentiable
-    in the vertices. Only its derivative means anything."""
-    edge, camera = gather_edges(shown, samples.edge), camera_of(batch.records, samples.view)
-    ax, ay, _ = project(camera, edge.a, batch.grid.size)
-    bx, by, _ = project(camera, edge.b, batch.grid.size)
-    x, y = dr.lerp(ax, bx, samples.position), dr.lerp(ay, by, samples.position)
-    return dr.fma(samples.normal_x, x, samples.normal_y * y)

@@ -9,18 +9,25 @@ and behind the crossing follows its place, and from its derivative the motion of
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import isqrt
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
 
+from appearance_opt.render.boundary.neighbours import Blend, FineGrid, Neighbours
+from appearance_opt.render.boundary.silhouettes import edges_of
+from appearance_opt.render.boundary.walk import search
 from appearance_opt.render.camera import Camera, camera_of, direction
-from appearance_opt.render.drawn import Shown
 from appearance_opt.render.math import clamp
-from appearance_opt.render.pixels import Batch
 from appearance_opt.render.samples import Samples
-from appearance_opt.render.silhouette import edges_of
-from appearance_opt.render.silhouette_walk import Neighbours
 from appearance_opt.render.surface import vertex_position
+
+if TYPE_CHECKING:
+    from appearance_opt.render.drawn import Drawn, Shown
+    from appearance_opt.render.freezing import Run
+    from appearance_opt.render.pixels import Batch, Grid
+    from appearance_opt.render.sampling import Sampling
 
 FLATTEST = 2e-5
 """Sheets whose reciprocal depths differ less, before and behind a crossing together and relative to
@@ -29,13 +36,13 @@ contact too flat to have a place."""
 
 
 @dataclass
-class Intersections:
+class Crossings:
     """M places where one sheet passes through another between two samples, ``inside`` and
     ``outside``.
 
     ``horizontal``: are they beside each other? ``position``: of the crossing, from the inside
     sample in units of their distance; ``area``: that is swept when it moves by one unit, in pixels;
-    ``pixel``: index of the pixel that changes.
+    the rest: see ``Boundary``.
     """
 
     inside: Samples
@@ -44,11 +51,48 @@ class Intersections:
     position: mi.Float
     area: mi.Float
     pixel: mi.UInt32
+    contrast: mi.ArrayXf | None = None
+
+    @property
+    def measure(self) -> mi.Float:
+        """See ``Boundary``."""
+        return self.area
+
+    def motion(self, shown: Shown, batch: Batch) -> mi.Float:
+        """See ``Boundary``: the position of each crossing in units of the samples' distance."""
+        first, last = _differences(shown, batch, self.inside, self.outside)
+        return first / (first - last)
+
+    def corrected(self, image: mi.Float, rays: int, grid: Grid) -> mi.Float:
+        """See ``Boundary``: crossings know nothing of what is covered."""
+        return image
 
 
-def find(shown: Shown, batch: Batch, pairs: Neighbours) -> Intersections | None:
-    """The crossings between samples whose sheets go on under each other. None without any. ``area``
-    and ``pixel`` are left to the caller."""
+@dataclass(frozen=True)
+class Intersections:
+    """A ``Finder`` of crossings, by comparing as many rays on a regular grid as pixels have
+    samples (price: docs/accuracy.md)."""
+
+    @property
+    def walks(self) -> bool:
+        return True
+
+    def find(
+        self, drawn: Drawn, batch: Batch, sampling: Sampling, seed: int, run: Run
+    ) -> Crossings | None:
+        """See ``Finder``."""
+        fine = FineGrid.of(batch, isqrt(sampling.samples))
+        found = search(drawn.shown, *fine.trace(drawn.scene, run), fine, run)
+        if found.meeting is None:
+            return None
+        there = crossings(drawn.shown, fine, found.meeting)
+        return None if there is None else there[0]
+
+
+def crossings(shown: Shown, fine: FineGrid, meeting: Neighbours) -> tuple[Crossings, Blend] | None:
+    """(where sheets that are ``meeting`` pass through each other, what moves between pixels there),
+    None without any."""
+    pairs, batch = meeting, fine.samples
     front, back = pairs.front, pairs.back
     camera = camera_of(batch.records, front.view)
     first, last = _differences(shown, batch, front, back)
@@ -63,14 +107,17 @@ def find(shown: Shown, batch: Batch, pairs: Neighbours) -> Intersections | None:
         return None
     p = pairs.keep(kept)
     position = clamp(dr.gather(mi.Float, first / (first - last), kept), 0, 1)
-    return Intersections(p.front, p.back, p.horizontal, position, mi.Float(1), mi.UInt32(0))
-
-
-def motion(shown: Shown, batch: Batch, found: Intersections) -> mi.Float:
-    """Position of each crossing in units of the samples' distance, differentiable in the
-    vertices."""
-    first, last = _differences(shown, batch, found.inside, found.outside)
-    return first / (first - last)
+    blend = Blend.of(p, position, fine)
+    out = Crossings(
+        fine.coarse(p.front),
+        fine.coarse(p.back),
+        p.horizontal,
+        position,
+        dr.opaque(mi.Float, 1 / fine.per_axis**2),
+        blend.pixel,
+    )
+    dr.eval(out)
+    return out, blend
 
 
 def _differences(

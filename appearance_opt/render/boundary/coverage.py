@@ -11,17 +11,11 @@ coverage outside of [0, 1]) is it brought back, which is always nearer to the tr
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import drjit as dr
 import mitsuba as mi
 
 from appearance_opt.render.lattice import sub_pixel_offsets
 from appearance_opt.render.math import at_least, at_most
-
-if TYPE_CHECKING:
-    from appearance_opt.render.pixels import Grid
-    from appearance_opt.render.silhouette import EdgeSamples
 
 
 def half_plane_area(nx: mi.Float, ny: mi.Float, distance: mi.Float) -> mi.Float:
@@ -37,27 +31,13 @@ def half_plane_area(nx: mi.Float, ny: mi.Float, distance: mi.Float) -> mi.Float:
     return dr.select(distance > 0, 1 - beyond, beyond)
 
 
-def correction(edges: EdgeSamples, contrast: mi.ArrayXf, samples: int, grid: Grid) -> mi.Float:
-    """What ``samples`` rays per pixel missed: (pixels * 4) premultiplied radiance and coverage,
-    zero where no silhouette point lies. ``contrast``: c_in - c_out at the points."""
-    row = edges.pixel // grid.rows
-    column = edges.pixel - row * grid.rows
-    row -= (row // grid.rows) * grid.rows
-    x = edges.inside.x - mi.Float(column) - 0.5
-    y = edges.inside.y - mi.Float(row) - 0.5
-    nx, ny = edges.normal_x, edges.normal_y
-    distance = dr.fma(nx, x, ny * y)
+def missed_area(nx: mi.Float, ny: mi.Float, distance: mi.Float, samples: int) -> mi.Float:
+    """Covered area that ``samples`` rays of a pixel miss, of its square about the origin where
+    n . p < ``distance``; negative where they see too much."""
     seen = mi.Float(0)
     for dx, dy in sub_pixel_offsets(samples) - 0.5:
         seen += dr.select(nx * float(dx) + ny * float(dy) < distance, mi.Float(1 / samples), 0)
-    missed = half_plane_area(nx, ny, distance) - seen
-    # several points of one line: their mean
-    count = dr.zeros(mi.UInt32, grid.pixels)
-    dr.scatter_reduce(dr.ReduceOp.Add, count, mi.UInt32(1), edges.pixel)
-    missed /= mi.Float(dr.gather(mi.UInt32, count, edges.pixel))
-    out = dr.zeros(mi.Float, grid.pixels * 4)
-    dr.scatter_reduce(dr.ReduceOp.Add, out, contrast * missed, edges.pixel)
-    return out
+    return half_plane_area(nx, ny, distance) - seen
 
 
 def add_missed(image: mi.Float, missed: mi.Float) -> mi.Float:

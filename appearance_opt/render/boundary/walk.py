@@ -3,94 +3,67 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
 
+from appearance_opt.render.boundary.neighbours import FineGrid, Neighbours, neighbours
+from appearance_opt.render.boundary.silhouettes import edges_of, gather_edges, is_silhouette
 from appearance_opt.render.camera import camera_of, project
-from appearance_opt.render.drawn import Shown
-from appearance_opt.render.outlines import NOTHING
 from appearance_opt.render.passing import MISS
-from appearance_opt.render.pixels import Batch, Grid, pixel_index
-from appearance_opt.render.samples import Samples, concat, join_arrays
-from appearance_opt.render.silhouette import edges_of, gather_edges, is_silhouette
+from appearance_opt.render.samples import Samples, join_arrays
 from appearance_opt.render.surface import vertex_position
+
+if TYPE_CHECKING:
+    from appearance_opt.render.drawn import Shown
+    from appearance_opt.render.freezing import Run
+    from appearance_opt.render.pixels import Batch
 
 LONGEST = 32
 """Triangles between a sample and where a walk ends, at most."""
 
 
 @dataclass
-class Neighbours:
-    """Samples beside each other (``horizontal``) or above each other that see different triangles:
-    ``front`` the nearer one, by depth, and ``back``."""
+class Between:
+    """What lies between neighbouring samples. ``outlines``: those with a silhouette between them,
+    and the number of its edge; ``meeting``: those whose sheets go on under each other. None without
+    any."""
 
-    front: Samples
-    back: Samples
-    horizontal: mi.Bool
-
-    def keep(self, index: mi.UInt32) -> Neighbours:
-        """Those at the given positions of the list."""
-        kept = dr.gather(mi.Bool, self.horizontal, index)
-        return Neighbours(self.front.keep(index), self.back.keep(index), kept)
-
-    def swapped(self) -> Neighbours:
-        """Seen from the other side."""
-        return Neighbours(self.back, self.front, self.horizontal)
-
-    def join(self, other: Neighbours) -> Neighbours:
-        """Both lists, one after the other."""
-        horizontal = join_arrays([mi.UInt32(self.horizontal), mi.UInt32(other.horizontal)]) == 1
-        return Neighbours(
-            concat([self.front, other.front]), concat([self.back, other.back]), horizontal
-        )
-
-    @property
-    def width(self) -> int:
-        return dr.width(self.horizontal)
+    outlines: tuple[Neighbours, mi.UInt32] | None = None
+    meeting: Neighbours | None = None
 
 
-def neighbours(hits: Samples, depth: mi.Float, fine: Grid) -> Neighbours | None:
-    """All neighbours among ``hits``, one in every pixel of ``fine``, that see different triangles.
-    None without."""
-    index = pixel_index(hits, fine.rows)
-    triangles, depths = dr.empty(mi.UInt32, fine.pixels), dr.empty(mi.Float, fine.pixels)
-    dr.scatter(triangles, hits.triangle, index, mode=dr.ReduceMode.Permute)
-    dr.scatter(
-        depths,
-        dr.select(hits.triangle == MISS, mi.Float(NOTHING), depth),
-        index,
-        mode=dr.ReduceMode.Permute,
+def search(shown: Shown, hits: Samples, depth: mi.Float, fine: FineGrid, run: Run) -> Between:
+    """What lies between ``hits``, one sample in every pixel of the finer grid."""
+    assert edges_of(shown).around is not None, "walks need edges of ``edge_list.walkable``"
+    every = neighbours(hits, depth, fine.samples.grid)
+    if every is None:
+        return Between()
+    edge, covers = run(walk, shown, fine.samples, every)
+    kept = dr.compress(edge != MISS)
+    outlines = [(every.keep(kept), dr.gather(mi.UInt32, edge, kept))]
+    # the front sheet goes on under the back sample without being seen there: the back sheet lies
+    # before it
+    under = dr.compress(
+        (covers != MISS) & (every.back.triangle != MISS) & (covers != every.back.triangle)
     )
-    dr.eval(triangles, depths)
-    found = []
-    for horizontal in (True, False):
-        inside = (fine.column if horizontal else fine.row) + 1 < fine.rows
-        step = mi.UInt32(1) if horizontal else fine.rows
-        other = dr.gather(mi.UInt32, triangles, index + step, inside)
-        found.append(dr.compress(inside & (other != hits.triangle)))
-    there = [k for k in (0, 1) if dr.width(found[k])]
-    if not there:
-        return None
-    one = concat([hits.keep(found[k]) for k in there])
-    horizontal = join_arrays([dr.full(mi.UInt32, k == 0, dr.width(found[k])) for k in there]) == 1
-    dr.eval(one, horizontal)
-    at = pixel_index(one, fine.rows)
-    beyond = at + dr.select(horizontal, 1, fine.rows)
-    x, y = dr.select(horizontal, one.x + 1, one.x), dr.select(horizontal, one.y, one.y + 1)
-    other = Samples(one.view, x, y, dr.gather(mi.UInt32, triangles, beyond))
-    first = dr.gather(mi.Float, depths, at) <= dr.gather(mi.Float, depths, beyond)
-    out = Neighbours(choose(first, one, other), choose(first, other, one), horizontal)
-    dr.eval(out.front, out.back)
+    out = Between()
+    if dr.width(under):
+        other = every.keep(under).swapped()
+        edge, returns = run(walk, shown, fine.samples, other)
+        kept = dr.compress(edge != MISS)
+        outlines.append((other.keep(kept), dr.gather(mi.UInt32, edge, kept)))
+        kept = dr.compress((returns != MISS) & (returns != other.back.triangle))
+        if dr.width(kept):
+            out.meeting = other.keep(kept).swapped()
+    outlines = [o for o in outlines if o[0].width]
+    if len(outlines) == 1:
+        out.outlines = outlines[0]
+    elif outlines:
+        (one, first), (other, second) = outlines
+        out.outlines = one.join(other), join_arrays([first, second])
     return out
-
-
-def choose(condition: mi.Bool, one: Samples, other: Samples) -> Samples:
-    """``one`` where the condition holds, else ``other``, of the same views."""
-    fields = [
-        dr.select(condition, getattr(one, f), getattr(other, f)) for f in ("x", "y", "triangle")
-    ]
-    return Samples(one.view, *fields)
 
 
 def walk(shown: Shown, batch: Batch, pairs: Neighbours) -> tuple[mi.UInt32, mi.UInt32]:
