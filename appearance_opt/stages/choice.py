@@ -56,9 +56,7 @@ def _fit_shape(
     seconds = run.seconds_left()
     steps = 1000 if options.fit.steps is None and seconds is None else options.fit.steps
     share = None if steps is None else round(SHARE * steps)
-    effort = Effort(
-        None if seconds is None else SHARE * seconds, share, run.progress, run.interrupts
-    )
+    effort = Effort(None if seconds is None else SHARE * seconds, share, run)
     start, interrupted = run.make_or_resume(lambda: make(effort))
     if interrupted:  # Ctrl-C ends both fits
         return start, with_values(options, steps=0)

@@ -15,7 +15,6 @@ from appearance_opt.latent.latent import Latent
 from appearance_opt.latent.parameter import Rates
 from appearance_opt.latent.texels import Texels
 from appearance_opt.optimize.loop import FitResult, fit
-from appearance_opt.optimize.observers import Observer, Reporter, Stop
 from appearance_opt.optimize.plan import FitOptions
 from appearance_opt.optimize.validation import Validation
 from appearance_opt.reference.pool import ReferencePool
@@ -102,14 +101,9 @@ def fit_start(
         quality=quality,
         seed=o.views.seed,
     )
-    observers: list[Observer] = [Stop(run.interrupts.asked)]
-    if run.progress is not None:
-        observers.append(Reporter(run.progress))
-    if run.checkpointer is not None:
-        observers.append(run.checkpointer)
     error = None
     try:
-        fitted = fit(model, pool, validation, fit_options, observers)
+        fitted = fit(model, pool, validation, fit_options, run.observers())
     except DivergedError as diverged:
         error, fitted = diverged, FitResult()
     run.lap("fit")

@@ -20,7 +20,6 @@ from appearance_opt.errors import InputError
 from appearance_opt.initial.atlas import unwrap
 from appearance_opt.initial.decimate import decimate
 from appearance_opt.initial.sphere import SMALLEST, random_maps, sphere
-from appearance_opt.interrupts import Interrupts
 from appearance_opt.latent.build import latent_of
 from appearance_opt.latent.displacement import DISPLACEMENT
 from appearance_opt.latent.export import to_asset
@@ -29,7 +28,6 @@ from appearance_opt.latent.mesh import LatentMesh
 from appearance_opt.latent.parameter import Rates
 from appearance_opt.latent.positions import Positions
 from appearance_opt.optimize.loop import FitResult, fit
-from appearance_opt.optimize.observers import Observer, Reporter, Stop
 from appearance_opt.optimize.plan import FitOptions
 from appearance_opt.optimize.validation import Validation
 from appearance_opt.reference.mesh import MeshReference
@@ -37,6 +35,7 @@ from appearance_opt.reference.pool import ReferencePool
 from appearance_opt.reference.survey import MeshSurvey
 from appearance_opt.stages.displacement import flat_map
 from appearance_opt.stages.fitting import VALIDATION_VIEWS, clean_maps
+from appearance_opt.stages.run import Run
 from appearance_opt.stages.start import Start, require_survey, select_told, transfer_appearance
 from appearance_opt.views import VALIDATION
 
@@ -46,7 +45,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from appearance_opt.config import SimplifyOptions
-    from appearance_opt.progress import Progress
     from appearance_opt.reference.subject import Subject
     from appearance_opt.views import ViewSampler
 
@@ -81,13 +79,11 @@ go."""
 
 @dataclass(frozen=True)
 class Effort:
-    """How long the shape is fitted (whichever comes first), who is told, and who may end it
-    early."""
+    """How long the shape is fitted (whichever comes first), and the job that it is a part of."""
 
     seconds: float | None
     steps: int | None
-    progress: Progress | None = None
-    interrupts: Interrupts = field(default_factory=Interrupts)
+    run: Run = field(default_factory=Run)
 
 
 def sphere_start(subject: Subject, options: SimplifyOptions, triangles: int) -> Start:
@@ -186,10 +182,8 @@ def _fit_shape(
         background=options.views.background_color(),
         seed=options.views.seed,
     )
-    effort.interrupts.protect()
-    observers: list[Observer] = [Stop(effort.interrupts.asked)]
-    if effort.progress is not None:
-        observers.append(Reporter(effort.progress))
+    effort.run.interrupts.protect()
+    observers = effort.run.observers(resumable=False)
     result = fit(model, pool, validation, fit_options, observers)
     log.info(
         "shape by preconditioned steps: %d of them, %.2f dB", result.steps, result.curve[-1].psnr

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from appearance_opt.interrupts import Interrupts
 from appearance_opt.latent.mesh import LatentMesh
+from appearance_opt.optimize.observers import Observer, Reporter, Stop
 from appearance_opt.stages.start import Start
 
 if TYPE_CHECKING:
@@ -68,6 +69,15 @@ class Run:
             return None
         reserve = EXPORT_SECONDS + (REPORT_SECONDS if self.with_report else 0.0)
         return max(self.budget - self.watch.total - reserve, 0.0)
+
+    def observers(self, *, resumable: bool = True) -> list[Observer]:
+        """Who watches a fit: Ctrl-C, progress, and the checkpoint, if its state is ``resumable``."""
+        out: list[Observer] = [Stop(self.interrupts.asked)]
+        if self.progress is not None:
+            out.append(Reporter(self.progress))
+        if resumable and self.checkpointer is not None:
+            out.append(self.checkpointer)
+        return out
 
     def make_or_resume(self, make: Callable[[], tuple[Start, bool]]) -> tuple[Start, bool]:
         """(start, interrupted) as ``make`` makes it; a resumed run takes it from beside its
