@@ -100,7 +100,7 @@ def add_command(app: typer.Typer, kind: str, function: Callable[..., None]) -> N
     def command(**arguments: Any) -> None:
         paths = tuple(arguments.pop(p.name) for p in inputs)
         values = {p.name: arguments.pop(p.name) for p in options}
-        written = {k: v for k, v in values.items() if v is not None and v != []}
+        written = {k: v for k, v in values.items() if v is not None and v not in ([], ())}
         function(Given(kind, paths, written), **arguments)
 
     command.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]

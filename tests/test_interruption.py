@@ -298,7 +298,7 @@ def test_outputs_that_cannot_be_written_are_refused_before_any_work(tmp_path: Pa
         {"report": "file"},
         {"checkpoint": "file"},
         {"report": "file/x"},
-        {"textures": "file"},
+        {"loose": "file"},
     ):
         with pytest.raises(InputError, match="not a folder"):
             Outputs.of(tmp_path / "x.glb", **{k: tmp_path / v for k, v in folder.items()}).check()

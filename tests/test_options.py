@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
+from appearance_opt import cli
 from appearance_opt.cli import app
 from appearance_opt.config import (
     JOBS,
@@ -165,3 +166,21 @@ def test_a_field_without_a_range_is_free() -> None:
     for wrong in (0.0, 1.5, float("nan")):
         with pytest.raises(InputError, match=r"--share .*: must be above 0 and at most 1"):
             Free("x", wrong)
+
+
+def test_the_command_line_goes_before_a_file_and_a_file_before_the_preset(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    specs: list = []
+    monkeypatch.setattr(cli, "_run", lambda spec, *others, **kept: specs.append(spec))
+    file = tmp_path / "options.toml"
+    file.write_text(
+        'preset = "final"\ntriangles = 9\nvariant = "worn"\nresolution = 100\npool = 9\n'
+    )
+    words = ["simplify", "a.glb", "--out", "b.glb", "--config", str(file), "--ratio", "0.5"]
+    assert CliRunner().invoke(app, [*words, "--pool", "7"]).exit_code == 0
+    made = specs[0].options
+    assert (made.start.triangles, made.start.ratio, made.start.reallocate) == (None, 0.5, 2)
+    assert (made.views.resolution, made.views.pool, made.asset.variant) == (100, 7, ("worn",))
+    assert CliRunner().invoke(app, [*words, "--preset", "draft", "--variant", "x"]).exit_code == 0
+    assert (specs[1].options.fit.budget, specs[1].options.asset.variant) == (19.0, ("x",))
