@@ -7,11 +7,13 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from appearance_opt.asset import Asset, load, save
     from appearance_opt.config import (
+        AnimateOptions,
         BakeOptions,
         CompareOptions,
         InspectOptions,
         JointOptions,
         SimplifyOptions,
+        animate_options,
         bake_options,
         joint_options,
         simplify_options,
@@ -24,6 +26,7 @@ if TYPE_CHECKING:
         ReferenceRenderError,
     )
     from appearance_opt.evaluate.comparison import Comparison
+    from appearance_opt.jobs.animate import AnimateResult, animate
     from appearance_opt.jobs.bake import bake
     from appearance_opt.jobs.compare import compare
     from appearance_opt.jobs.fit import fit
@@ -32,6 +35,7 @@ if TYPE_CHECKING:
     from appearance_opt.jobs.result import BakeResult, Result, SimplifyResult
     from appearance_opt.jobs.simplify import simplify
     from appearance_opt.jobs.spec import JobSpec, run
+    from appearance_opt.options.animation import AnimationOptions
     from appearance_opt.options.baking import BakingOptions
     from appearance_opt.options.fitting import FittingOptions
     from appearance_opt.options.maps import DisplacementOptions, TextureOptions
@@ -43,6 +47,9 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _HOMES = {
+    "AnimateOptions": "appearance_opt.config",
+    "AnimateResult": "appearance_opt.jobs.animate",
+    "AnimationOptions": "appearance_opt.options.animation",
     "AppearanceError": "appearance_opt.errors",
     "Asset": "appearance_opt.asset",
     "AssetOptions": "appearance_opt.options.reading",
@@ -68,6 +75,8 @@ _HOMES = {
     "StartOptions": "appearance_opt.options.start",
     "TextureOptions": "appearance_opt.options.maps",
     "ViewOptions": "appearance_opt.options.views",
+    "animate": "appearance_opt.jobs.animate",
+    "animate_options": "appearance_opt.config",
     "bake": "appearance_opt.jobs.bake",
     "bake_options": "appearance_opt.config",
     "compare": "appearance_opt.jobs.compare",
@@ -83,6 +92,9 @@ _HOMES = {
 }
 
 __all__ = [
+    "AnimateOptions",
+    "AnimateResult",
+    "AnimationOptions",
     "AppearanceError",
     "Asset",
     "AssetOptions",
@@ -108,6 +120,8 @@ __all__ = [
     "StartOptions",
     "TextureOptions",
     "ViewOptions",
+    "animate",
+    "animate_options",
     "bake",
     "bake_options",
     "compare",

@@ -15,6 +15,7 @@ from appearance_opt.errors import InputError
 from appearance_opt.options.jobs import (
     JOBS,
     PRESETS,
+    AnimateOptions,
     BakeOptions,
     CommonOptions,
     CompareOptions,
@@ -27,12 +28,14 @@ from appearance_opt.options.option import Record, check_choice, entries, flag_na
 __all__ = [
     "JOBS",
     "PRESETS",
+    "AnimateOptions",
     "BakeOptions",
     "CommonOptions",
     "CompareOptions",
     "InspectOptions",
     "JointOptions",
     "SimplifyOptions",
+    "animate_options",
     "as_dict",
     "bake_options",
     "flat_keys",
@@ -52,6 +55,11 @@ def simplify_options(preset: str = "default", **values: Any) -> SimplifyOptions:
     """Options from a preset and what overrides it. Raises InputError for unknown names and bad
     values."""
     return make_options(SimplifyOptions, preset, values)
+
+
+def animate_options(preset: str = "default", **values: Any) -> AnimateOptions:
+    """The same for an animated character."""
+    return make_options(AnimateOptions, preset, values)
 
 
 def bake_options(preset: str = "default", **values: Any) -> BakeOptions:

@@ -11,10 +11,12 @@ from collections.abc import Callable, Sequence
 from appearance_opt.asset import Asset, save
 from appearance_opt.errors import InputError
 from scenes import analytic
+from scenes.creature import creature
 from scenes.relic import relic
 
 SCENES: dict[str, Callable[..., Asset]] = {
     "relic": relic,
+    "creature": creature,
     "furnace": analytic.furnace,
     "checker": analytic.checker,
     "torus": analytic.torus,

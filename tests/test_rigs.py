@@ -11,7 +11,7 @@ import pytest
 from appearance_opt.asset import Asset, FileOptions, load, save
 from appearance_opt.asset.influences import repair_influences, sparse
 from appearance_opt.asset.notes import Notes
-from appearance_opt.asset.posing import pose, pose_asset, pose_mesh, pose_positions
+from appearance_opt.asset.posing import bone_matrices, pose, pose_asset, pose_mesh, pose_positions
 from appearance_opt.asset.rig import Clip, estimate_rate
 from appearance_opt.asset.transforms import compose, decompose, slerp
 from appearance_opt.errors import InputError
@@ -42,6 +42,14 @@ def test_poses_are_those_of_the_specification(tmp_path: Path) -> None:
     for clip in ("walk", "spin.1"):
         for time in TIMES:
             assert largest_difference(plain.positions(clip, time), posed(asset, clip, time)) < 1e-6
+
+
+def test_many_times_at_once_are_each_by_itself(tmp_path: Path) -> None:
+    rig = load(character(tmp_path / "x.glb"), keep_rig=True).rig
+    for clip in rig.clips:
+        together = bone_matrices(rig, clip, TIMES)
+        for time, matrices in zip(TIMES, together, strict=True):
+            np.testing.assert_array_equal(bone_matrices(rig, clip, [time])[0], matrices)
 
 
 def test_at_rest_it_is_what_the_static_commands_see(tmp_path: Path) -> None:

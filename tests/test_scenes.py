@@ -19,6 +19,7 @@ from scenes.relic import relic
 CLOSED = ("relic", "furnace", "torus", "two_materials", "bumpy_sphere")
 SMALL = {
     "relic": {"triangles": 40_000, "texture_size": 256},
+    "creature": {"triangles": 10_000, "texture_size": 64},
     "bumpy_sphere": {"triangles": 10_000, "texture_size": 64},
 }
 

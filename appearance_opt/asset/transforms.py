@@ -16,8 +16,12 @@ precision."""
 
 
 def compose(translation: NDArray, rotation: NDArray, scale: NDArray) -> NDArray[np.float64]:
-    """(..., 4, 4) translation (..., 3) * rotation, unit quaternion (..., 4), * scale (..., 3)."""
-    x, y, z, w = np.moveaxis(np.asarray(rotation, np.float64), -1, 0)
+    """(..., 4, 4) translation (..., 3) * rotation, unit quaternion (..., 4), * scale (..., 3), the
+    leading axes of which are broadcast."""
+    given = (translation, rotation, scale)
+    shape = np.broadcast_shapes(*(np.shape(v)[:-1] for v in given))
+    turned = np.broadcast_to(np.asarray(rotation, np.float64), (*shape, 4))
+    x, y, z, w = np.moveaxis(turned, -1, 0)
     turn = np.array(
         [
             [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
@@ -25,7 +29,7 @@ def compose(translation: NDArray, rotation: NDArray, scale: NDArray) -> NDArray[
             [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
         ]
     )
-    out = np.zeros((*x.shape, 4, 4))
+    out = np.zeros((*shape, 4, 4))
     out[..., :3, :3] = (
         np.moveaxis(turn, (0, 1), (-2, -1)) * np.asarray(scale, np.float64)[..., None, :]
     )

@@ -49,11 +49,14 @@ def open_run(
         yield run
 
 
-def load_source(source: str | Path | Asset, options: CommonOptions) -> Asset:
-    """``source`` itself, or the file of that name, read as the options say."""
+def load_source(
+    source: str | Path | Asset, options: CommonOptions, keep_rig: bool = False
+) -> Asset:
+    """``source`` itself, or the file of that name, read as the options say. ``keep_rig``: see
+    ``load``."""
     if not isinstance(source, (str, Path)):
         return source
-    return load(source, **options.asset.arguments())
+    return load(source, keep_rig=keep_rig, **options.asset.arguments())
 
 
 def load_layout(source: str | Path | Asset, options: CommonOptions, missing_textures: str) -> Asset:

@@ -18,23 +18,29 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from appearance_opt.asset.rig import Skin
     from appearance_opt.latent.mesh import LatentMesh
 
 
 def to_asset(
-    mesh: LatentMesh, positions: NDArray, maps: Mapping[str, NDArray | float], name: str
+    mesh: LatentMesh,
+    positions: NDArray,
+    maps: Mapping[str, NDArray | float],
+    name: str,
+    skin: Skin | None = None,
 ) -> Asset:
     """One mesh, one material; two, with the same textures, where some faces are seen from both
     sides and others from their front only. ``positions`` (V, 3); ``maps``: natural values by
     channel name, images or numbers. Normals are angle weighted and tangents MikkTSpace's: what the
-    renderer of the fit uses, so that the maps mean the same in another one."""
+    renderer of the fit uses, so that the maps mean the same in another one. ``skin``: of the welded
+    vertices."""
     p, tangents = positions[mesh.frame_vertex], None
     normals = summed_normals(positions, mesh.faces, welded=True)[mesh.frame_vertex]
     index, faces, n = split_where_cancelled(p, mesh.frame_faces, normals)
-    p, uv = p[index], mesh.uvs[index]
+    p, uv, vertex = p[index], mesh.uvs[index], mesh.frame_vertex[index]
     if np.ndim(maps.get("normal_x", 0.0)):
         index, faces, tangents = split_and_tangents(p, n, uv, faces)
-        p, n, uv = p[index], n[index], uv[index]
+        p, n, uv, vertex = p[index], n[index], uv[index], vertex[index]
     whole = Mesh(
         positions=np.ascontiguousarray(p, np.float32),
         faces=np.ascontiguousarray(faces, np.int32),
@@ -43,6 +49,7 @@ def to_asset(
         tangents=tangents,
         material=_material(maps, name),
         name=name,
+        skin=None if skin is None else skin.take(vertex),
     )
     return Asset(_by_side(whole, mesh.single), name)
 
@@ -63,9 +70,7 @@ def _by_side(mesh: Mesh, single: NDArray[np.bool_] | None) -> tuple[Mesh, ...]:
 def _part(mesh: Mesh, faces: NDArray[np.bool_]) -> Mesh:
     """Some faces of a mesh, with the vertices that they use."""
     used, corners = np.unique(mesh.faces[faces], return_inverse=True)
-    arrays = {n: getattr(mesh, n) for n in ("positions", "normals", "uvs", "tangents")}
-    kept = {n: None if v is None else v[used] for n, v in arrays.items()}
-    return replace(mesh, faces=corners.reshape(-1, 3).astype(np.int32), **kept)  # type: ignore[arg-type]
+    return mesh.take(used, corners.reshape(-1, 3))
 
 
 def _material(maps: Mapping[str, NDArray | float], name: str) -> Material:

@@ -56,7 +56,7 @@ class TracedMesh:
 class Latent:
     """A mesh and its ``parts``, in the order in which they place vertices (``latent.build`` makes
     it). ``constants``: channels of the material without a map. ``poses``: those that it is drawn
-    at; ``pose`` is the one it is drawn at now.
+    at (of an animation one for each frame, in their order); ``pose`` is the one it is drawn at now.
 
     What is fitted are the ``parameters``. ``decode``, ``vertices``, ``surface``, ``maps``,
     ``track`` and ``gradients`` are pure (see ``latent.parts``).

@@ -56,6 +56,11 @@ class BoneFrames:
         rows = np.ascontiguousarray(matrices[:, :, :3], np.float32)
         return cls(mi.Float(rows.ravel()), rows.shape[1])
 
+    @property
+    def count(self) -> int:
+        """Frames."""
+        return dr.width(self.matrices) // (12 * self.bones)
+
 
 def softmax(logarithms: mi.Float, places: int) -> mi.Float:
     """Weights (V K) of sum one of the logarithms of shares (V K); K = ``places``."""

@@ -142,7 +142,8 @@ class FitRun:
         state, laplacians = self.state, self.gradients.laplacians
         views, reference = self.pool.draw(state.iteration)
         plan = self.plan.at(state.iteration, self.clock.progress(state.iteration))
-        self.latent.select(plan.pose)
+        shown = reference.frame  # of an animation the images say which
+        self.latent.select(plan.pose if shown is None else self.latent.poses[shown])
         inputs = StepInputs(
             views=views,
             reference=reference,

@@ -13,6 +13,8 @@ from appearance_opt.render.images import render_image
 from appearance_opt.render.pixels import Batch, Grid
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from numpy.typing import NDArray
 
     from appearance_opt.latent.latent import Latent
@@ -50,12 +52,13 @@ class Validation:
         try:
             for pose in latent.poses:
                 latent.select(pose)
-                each.append(self._psnr(latent))
+                each.append(self.score(latent))
         finally:
             latent.select(current)
         return float(np.mean(each))
 
-    def _psnr(self, latent: Latent) -> float:
+    def score(self, latent: Latent) -> float:
+        """The same for the pose that is drawn now."""
         image = self.render(latent)
         finite = np.isfinite(image).all(axis=(1, 2, 3))
         if not finite.all():
@@ -66,3 +69,26 @@ class Validation:
         either = self._covered | (image[..., 3] > 0)
         each = [e[m].mean() if m.any() else 1e-10 for e, m in zip(error, either, strict=True)]
         return float(np.mean([-10 * np.log10(max(e, 1e-10)) for e in each]))
+
+
+class FrameValidation:
+    """Held-out views of some frames of an animation. ``frames``: number of the frame, and its
+    views."""
+
+    def __init__(self, frames: Sequence[tuple[int, Validation]]) -> None:
+        self.frames = tuple(frames)
+
+    def scores(self, latent: Latent) -> list[float]:
+        """PSNR in dB of each of its frames. Raises DivergedError as ``Validation`` does."""
+        current, each = latent.pose, []
+        try:
+            for frame, validation in self.frames:
+                latent.select(latent.poses[frame])
+                each.append(validation.score(latent))
+        finally:
+            latent.select(current)
+        return each
+
+    def psnr(self, latent: Latent) -> float:
+        """Mean over its frames of the PSNR in dB (see ``Validation``)."""
+        return float(np.mean(self.scores(latent)))

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from appearance_opt.options.animation import AnimationOptions
 from appearance_opt.options.baking import BakingOptions
 from appearance_opt.options.files import OutputOptions
 from appearance_opt.options.fitting import FittingOptions
@@ -91,6 +92,14 @@ class JointOptions(CommonOptions):
 
 
 @dataclass(frozen=True)
+class AnimateOptions(SimplifyOptions):
+    """How to simplify what is animated. With "shape", weights are fitted, too."""
+
+    displacement: DisplacementOptions = part(DisplacementOptions, only=())
+    animation: AnimationOptions = part(AnimationOptions)
+
+
+@dataclass(frozen=True)
 class CompareOptions(Record):
     """How to compare two assets."""
 
@@ -165,6 +174,11 @@ JOBS: dict[str, Job] = {
         "Bake with LOW's shape free: fit it, a displacement, normals and material together.",
         JointOptions,
         ("HIGH", "LOW"),
+    ),
+    "animate": Job(
+        "Write an animated character with fewer triangles, fitted over the frames of its clips.",
+        AnimateOptions,
+        ("INPUT",),
     ),
     "compare": Job(
         "Measure how different two assets look: PSNR, FLIP, silhouettes.",

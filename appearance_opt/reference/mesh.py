@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -23,7 +24,7 @@ from appearance_opt.render.surface import Surface
 from appearance_opt.render.upload import MeshArrays
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Sequence
 
     from numpy.typing import NDArray
 
@@ -50,9 +51,8 @@ class MeshReference:
         maps = material_maps(list(by_id.values()))
         self.emission = emission_maps(list(by_id.values()))
         self.coverage = coverage_maps(list(by_id.values()))
-        self.merged = merge(
-            asset, [number[id(m.material)] for m in asset.meshes], maps.has_normal_map
-        )
+        self._material_of = [number[id(m.material)] for m in asset.meshes]
+        self.merged = merge(asset, self._material_of, maps.has_normal_map)
         m = self.merged
         self.single = single_sided(asset.meshes)
         passing = None
@@ -60,12 +60,22 @@ class MeshReference:
             passing = np.repeat(
                 [seen_through(m) for m in asset.meshes], [len(m.faces) for m in asset.meshes]
             )
-        hidden_backs = culled(m.positions, m.faces, self.single, passing)
+        self._hidden_backs = culled(m.positions, m.faces, self.single, passing)
         uvs = m.uvs if self._needs_uvs(maps) else None
-        self.drawn = Drawn.of(replace(m, uvs=uvs, culled=hidden_backs), maps)
+        self.drawn = Drawn.of(replace(m, uvs=uvs, culled=self._hidden_backs), maps)
         self._renderer: Renderer = images if self.coverage is None else SeenThrough(self.coverage)
         self._run = Frozen(self.surface, self.maps, self.coverage)
         self._grid: pixels.Grid | None = None
+
+    def moved(self, asset: Asset) -> MeshReference:
+        """The same with its vertices elsewhere. ``asset``: the one it was made of, ``completed``
+        before, moved."""
+        out, maps = copy(self), self.maps
+        out.merged = m = merge(asset, self._material_of, maps.has_normal_map)
+        uvs = m.uvs if self._needs_uvs(maps) else None
+        out.drawn = Drawn.of(replace(m, uvs=uvs, culled=self._hidden_backs), maps)
+        out._run = Frozen(out.surface, out.maps, out.coverage)
+        return out
 
     @property
     def scene(self) -> Scene:
@@ -149,14 +159,7 @@ def merge(asset: Asset, material_of: list[int], need_tangents: bool) -> MeshArra
     """Concatenate the meshes of an asset, vertices split where attributes differ; computes what a
     mesh lacks (angle-weighted normals, MikkTSpace tangents where a normal map needs them, zero UVs,
     white vertex colours)."""
-    meshes = fill_normals(asset.meshes)
-    if need_tangents:
-        lacking = [m.tangents is None for m in meshes]
-        mapped = [m.material.normal_texture is not None and m.uvs is not None for m in meshes]
-        meshes = replace_chosen(
-            meshes, [a and b for a, b in zip(lacking, mapped, strict=True)], _with_tangents
-        )
-    batch = Batch(meshes)
+    batch = Batch(completed(asset.meshes, need_tangents))
     normals = batch.joined("normals")
     tangents = None
     if need_tangents:
@@ -174,6 +177,17 @@ def merge(asset: Asset, material_of: list[int], need_tangents: bool) -> MeshArra
         faces=batch.faces.astype(np.int32),
         material=np.array(material_of, np.int32)[batch.mesh_of_face],
     )
+
+
+def completed(meshes: Sequence[Mesh], need_tangents: bool) -> list[Mesh]:
+    """The meshes with normals, and where ``need_tangents`` and a normal map reads them tangents."""
+    out = fill_normals(meshes)
+    if not need_tangents:
+        return out
+    lacking = [m.tangents is None for m in out]
+    mapped = [m.material.normal_texture is not None and m.uvs is not None for m in out]
+    chosen = [a and b for a, b in zip(lacking, mapped, strict=True)]
+    return replace_chosen(out, chosen, _with_tangents)
 
 
 def _with_tangents(batch: Batch) -> list[Mesh]:

@@ -30,10 +30,11 @@ FIRST = 8
 class Targets:
     """Reference images of a batch, flat (batch * pixels * 4): ``average`` over the pixels' areas,
     and what the rays through their middles see (``points``), or None where the reference cannot
-    tell."""
+    tell. ``frame``: number of the frame of an animation that they show, None without one."""
 
     average: mi.Float
     points: mi.Float | None = None
+    frame: int | None = None
 
 
 @dataclass
@@ -72,8 +73,7 @@ class ReferencePool:
             members = np.arange(self.batch) + newest * self.batch
         else:
             rng = np.random.default_rng([self.sampler.seed, self.sampler.stream, iteration, 1])
-            there = (newest - oldest + 1) * self.batch
-            members = oldest * self.batch + rng.choice(there, self.batch, replace=False)
+            members = self._chosen(rng, oldest, newest)
         self._forget(oldest * self.batch)
         missing = [int(k) for k in members if int(k) not in self._images]
         if missing:
@@ -85,7 +85,20 @@ class ReferencePool:
             for kept in (self._images, self._points)
         )
         assert images is not None
-        return views, Targets(images, points)
+        return views, Targets(images, points, self._frame_of(int(members[0]) // self.batch))
+
+    def _chosen(self, rng: np.random.Generator, oldest: int, newest: int) -> NDArray[np.int64]:
+        """(batch,) numbers of views that are there, in batches from ``oldest`` to ``newest``."""
+        there = (newest - oldest + 1) * self.batch
+        return oldest * self.batch + rng.choice(there, self.batch, replace=False)
+
+    def _frame_of(self, group: int) -> int | None:
+        """The frame that a batch shows."""
+        return None
+
+    def _source(self, group: int) -> tuple[Reference, ViewSampler]:
+        """What draws a batch, and its views."""
+        return self.reference, self.sampler
 
     @property
     def _groups(self) -> int:
@@ -110,14 +123,15 @@ class ReferencePool:
 
     def _render(self, groups: list[int]) -> None:
         for group in groups:
-            views = self.sampler.draw(group, self.batch)
-            if isinstance(self.reference, PointReference):
-                images, points = self.reference.pair(
+            reference, sampler = self._source(group)
+            views = sampler.draw(group, self.batch)
+            if isinstance(reference, PointReference):
+                images, points = reference.pair(
                     views, self.resolution, self.samples, self.point_width
                 )
                 self._keep(self._points, group, points)
             else:
-                images = self.reference.render(views, self.resolution, self.samples)
+                images = reference.render(views, self.resolution, self.samples)
             self._keep(self._images, group, images)
             for k in range(self.batch):
                 self._views[group * self.batch + k] = views[k : k + 1]

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
-from appearance_opt.config import with_values
+from appearance_opt.config import SimplifyOptions, with_values
 from appearance_opt.stages.decimated import decimate_start
 from appearance_opt.stages.growth import SHARE, Effort, grow_start, mend_start, sphere_start
 from appearance_opt.stages.start import budget, inherit_sides, require_survey, transfer_appearance
@@ -12,16 +12,18 @@ from appearance_opt.stages.start import budget, inherit_sides, require_survey, t
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from appearance_opt.config import SimplifyOptions
     from appearance_opt.latent.mesh import LatentMesh
     from appearance_opt.reference.subject import Subject
     from appearance_opt.stages.run import Run
     from appearance_opt.stages.start import Start
 
 
+Chosen = TypeVar("Chosen", bound=SimplifyOptions)
+
+
 def choose_start(
-    subject: Subject, given: LatentMesh | None, options: SimplifyOptions, run: Run
-) -> tuple[Start, SimplifyOptions]:
+    subject: Subject, given: LatentMesh | None, options: Chosen, run: Run
+) -> tuple[Start, Chosen]:
     """(start, options of the fit that follows). ``given``: the mesh that ``options.start.init``
     names, None if it names none. A shape that is far from its goal is fitted first, in a part of
     the time or the steps."""
@@ -50,8 +52,8 @@ def _make(make: Callable[[], Start], run: Run) -> Start:
 
 
 def _fit_shape(
-    make: Callable[[Effort], tuple[Start, bool]], options: SimplifyOptions, run: Run
-) -> tuple[Start, SimplifyOptions]:
+    make: Callable[[Effort], tuple[Start, bool]], options: Chosen, run: Run
+) -> tuple[Start, Chosen]:
     """(a start whose shape is fitted first, options of what is left of the fit)."""
     seconds = run.seconds_left()
     steps = 1000 if options.fit.steps is None and seconds is None else options.fit.steps

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from appearance_opt.asset.origin import Origin
+    from appearance_opt.asset.rig import Skin
     from appearance_opt.asset.types import Asset
     from appearance_opt.config import CommonOptions
     from appearance_opt.latent.latent import Latent
@@ -56,10 +57,13 @@ def export(
 
 class Exporter:
     """Assets of a displaced model, in the place and scale of the input, relative to its ``origin``.
-    ``placement``: of the model in the world."""
+    ``placement``: of the model in the world; ``skin``: of its vertices, if it has one."""
 
-    def __init__(self, placement: Placement, origin: Origin, name: str) -> None:
+    def __init__(
+        self, placement: Placement, origin: Origin, name: str, skin: Skin | None = None
+    ) -> None:
         self.placement, self.origin, self.name = placement.relative_to(origin), origin, name
+        self.skin = skin
 
     def base(self, model: Latent, maps: dict) -> Asset:
         """The base mesh, its maps, and the displacement map in metres."""
@@ -84,9 +88,8 @@ class Exporter:
         return out
 
     def _asset(self, mesh: LatentMesh, positions: NDArray, maps: dict, name: str) -> Asset:
-        return replace(
-            to_asset(mesh, self.placement.to_world(positions), maps, name), origin=self.origin
-        )
+        world = self.placement.to_world(positions)
+        return replace(to_asset(mesh, world, maps, name, self.skin), origin=self.origin)
 
 
 def write_companion(asset: Asset, out: Path) -> None:

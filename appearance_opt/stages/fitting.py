@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -14,7 +15,7 @@ from appearance_opt.latent.displacement import DISPLACEMENT
 from appearance_opt.latent.latent import Latent
 from appearance_opt.latent.parameter import Rates
 from appearance_opt.latent.texels import Texels
-from appearance_opt.optimize.loop import FitResult, fit
+from appearance_opt.optimize.loop import FitResult, Judge, fit
 from appearance_opt.optimize.plan import FitOptions
 from appearance_opt.optimize.validation import Validation
 from appearance_opt.reference.pool import ReferencePool
@@ -44,6 +45,10 @@ DISPLACEMENT_RATE = 4.0
 the finest edge, which is an eighth of the base edge at level 3."""
 
 
+WEIGHT_RATE = 5.0
+"""Rate of skinning weights, in logarithms of them, in units of that of the normal map."""
+
+
 def fit_start(
     subject: Subject, start: Start, options: CommonOptions, run: Run
 ) -> tuple[Latent, FitResult, DivergedError | None]:
@@ -70,6 +75,21 @@ def fit_start(
     validation = Validation(reference, held_out, min(o.views.resolution, 256))
     parts = frozenset(o.fit.parts) | ({DISPLACEMENT} if o.displacement.fitted else set())
     model = latent_of(start.mesh, start.maps, parts, Rates(), start.levels)
+    return model, *fit_latent(model, pool, validation, start, o, run)
+
+
+def fit_latent(
+    model: Latent,
+    pool: ReferencePool,
+    validation: Judge,
+    start: Start,
+    options: CommonOptions,
+    run: Run,
+    share: float = 1.0,
+) -> tuple[FitResult, DivergedError | None]:
+    """Fit a latent that was made from ``start`` to a pool, with rates by how good it is, within a
+    ``share`` of what is left of the budget. See ``fit_start``."""
+    o = options
     quality, rates = fit_policy(
         validation.psnr(model), start.relative, start.grown, patience(o, run.seconds_left())
     )
@@ -81,9 +101,11 @@ def fit_start(
         o.displacement.rate,
     )
     defaults = (rates.position, rates.normal, rates.base_color, rates.material, rates.displacement)
-    model.set_rates(Rates(*(d if g is None else g for g, d in zip(given, defaults, strict=True))))
+    chosen = (d if g is None else g for g, d in zip(given, defaults, strict=True))
+    model.set_rates(replace(Rates(*chosen), weight=WEIGHT_RATE * rates.normal))
     run.lap("set-up")
-    seconds = run.seconds_left()
+    left = run.seconds_left()
+    seconds = None if left is None else share * left
     if seconds == 0.0:
         log.warning(
             "--budget %.0f s holds no more than set-up (%.0f s so far) and writing: the result is the start, "
@@ -107,7 +129,7 @@ def fit_start(
     except DivergedError as diverged:
         error, fitted = diverged, FitResult()
     run.lap("fit")
-    return model, fitted, error
+    return fitted, error
 
 
 def point_width(resolution: int, texture_size: int) -> float:

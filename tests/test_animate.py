@@ -1,0 +1,175 @@
+"""Fits over an animation: gradients of a posed latent, frames, and the job ``animate``."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from appearance_opt.asset import Asset, load, save
+from appearance_opt.asset.posing import pose, pose_positions
+from appearance_opt.asset.rig import Skin
+from appearance_opt.errors import InputError
+from appearance_opt.initial.sphere import sphere
+from appearance_opt.jobs.animate import AnimateResult, animate
+from appearance_opt.latent.build import latent_of
+from appearance_opt.latent.positions import POSITIONS
+from appearance_opt.latent.skinning import WEIGHTS, BoneFrames
+from appearance_opt.optimize.losses import LOSSES
+from appearance_opt.optimize.step import Gradients, StepInputs
+from appearance_opt.options.animation import AnimationOptions
+from appearance_opt.options.views import ViewOptions
+from appearance_opt.reference.pool import Targets
+from appearance_opt.render.pixels import Grid
+from appearance_opt.render.quality import Quality
+from appearance_opt.stages.animation import Animation, choose_frames
+from appearance_opt.views import ViewSampler
+from scenes.analytic import bumpy_sphere
+from scenes.creature import creature
+
+QUICK = {
+    "triangles": 300, "steps": 6, "resolution": 48, "pool": 4, "views": 2, "texture_size": 64,
+    "reallocate": 0,
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def small() -> Asset:
+    return creature(2400, 64)
+
+
+@pytest.fixture(scope="module")
+def result(small: Asset, tmp_path_factory: pytest.TempPathFactory) -> tuple[AnimateResult, Path]:
+    folder = tmp_path_factory.mktemp("animate")
+    save(small, folder / "creature.glb")
+    made = animate(
+        folder / "creature.glb",
+        folder / "light.glb",
+        report=folder / "report",
+        influences=2,
+        clip="walk",
+        frames="0:24:8",
+        **QUICK,
+    )
+    return made, folder
+
+
+def test_gradients_are_those_of_the_posed_mesh_through_the_bones() -> None:
+    """A posed latent against a still one at the same vertices, whose gradients, silhouettes
+    included, others compare with differences: by the chain rule, to rounding."""
+    rng = np.random.default_rng(0)
+    mesh = sphere(200, (0.0, 0.0, 0.0), 0.6, 16)
+    count, bones = len(mesh.positions), 3
+    weights = rng.random((count, bones)).astype(np.float32)
+    skin = Skin(
+        np.tile(np.arange(bones, dtype=np.int32), (count, 1)),
+        weights / weights.sum(axis=1, keepdims=True),
+    )
+    matrices = np.tile(np.eye(4), (2, bones, 1, 1))
+    matrices[:, :, :3] += rng.normal(0, 0.15, (2, bones, 3, 4))
+    maps = {"red": 0.6, "green": 0.3, "blue": 0.2, "roughness": 0.5, "metalness": 0.0}
+    moving = latent_of(mesh, maps, ("shape",), skinned=(skin, BoneFrames.of(matrices)))
+    moving.select(moving.poses[1])
+    posed = moving.posed_mesh(moving.poses[1])
+    still = latent_of(replace(mesh, positions=posed.positions), maps, ("shape",))
+    grid = Grid(2, 40)
+    views = ViewSampler((0.0, 0.0, 0.0), 1.0, 4).draw(0, 2)
+    target = mi.Float(rng.random(4 * grid.pixels).astype(np.float32) * 0.5)
+    inputs = StepInputs(views, Targets(target), np.full((2, 3), 0.4, np.float32), 0.0, 0.0, 3)
+    found, truth = (
+        Gradients(m, grid, Quality(), LOSSES["l2"], freeze=False)(inputs)[1]
+        for m in (moving, still)
+    )
+    by_vertex = np.array(truth[POSITIONS], np.float64).reshape(-1, 3)
+    assert np.abs(by_vertex).max() > 0
+    stored = moving.parameters[WEIGHTS].value
+    w = np.exp(np.array(stored, np.float64).reshape(count, bones))
+    w /= w.sum(axis=1, keepdims=True)
+    m = matrices[1]
+    expected = np.einsum("vb,bij,vi->vj", w, m[:, :3, :3], by_vertex)
+    got = np.array(found[POSITIONS]).reshape(-1, 3)
+    assert np.abs(got - expected).max() < 2e-4 * np.abs(expected).max()
+    homogeneous = np.concatenate([mesh.positions, np.ones((count, 1))], axis=1)
+    by_weight = np.einsum("bij,vj,vi->vb", m[:, :3], homogeneous, by_vertex)
+    expected = w * (by_weight - (w * by_weight).sum(axis=1, keepdims=True))
+    got = np.array(found[WEIGHTS]).reshape(count, bones)
+    assert np.abs(got - expected).max() < 2e-4 * np.abs(expected).max()
+
+
+def test_a_frame_in_its_own_coordinates_is_the_posed_asset(small: Asset) -> None:
+    animation = Animation.of(
+        small, AnimationOptions(clips=("walk",), frames="0:24:12"), ViewOptions()
+    )
+    assert [str(f) for f in animation.frames] == ["walk 0", "walk 12"]
+    for k, frame in enumerate(animation.frames):
+        drawn = animation.reference.at(k)
+        there = animation.placements[k].to_world(drawn.merged.positions)
+        matrices = pose(small, frame.clip, frame.time)
+        expected = np.concatenate([pose_positions(m, matrices) for m in small.meshes])
+        np.testing.assert_allclose(there, expected, atol=2e-6)
+        assert np.linalg.norm(drawn.merged.positions, axis=1).max() < 1.05
+    assert {p.scale for p in animation.placements} == {animation.placements[0].scale}
+
+
+def test_pools_show_each_frame_as_often_as_the_others(small: Asset) -> None:
+    animation = Animation.of(
+        small, AnimationOptions(clips=("look",), frames="0:24:8"), ViewOptions()
+    )
+    pool = animation.pool(ViewOptions(resolution=16, per_step=2, pool=12, reuse=0), 1, 0.4)
+    frames = [pool.draw(k)[1].frame for k in range(6)]
+    assert sorted(frames[:3]) == [0, 1, 2] == sorted(frames[3:])
+    assert pool.draw(40)[1].frame in (0, 1, 2)
+
+
+def test_frames_that_options_ask_for(small: Asset) -> None:
+    def chosen(**values: object) -> list[str]:
+        return [str(f) for f in choose_frames(small.rig, AnimationOptions(**values))]
+
+    assert chosen(clips=("look",), frames="3:9:3") == ["look 3", "look 6"]
+    assert chosen(clips=("walk",), frames="20:") == [f"walk {k}" for k in range(20, 25)]
+    assert len(chosen()) == 48
+    with pytest.raises(InputError, match=r"--frames 90:99: none of them is in clip 'walk'"):
+        chosen(frames="90:99")
+    with pytest.raises(InputError, match="did you mean 'walk'"):
+        chosen(clips=("wakl",))
+    for wrong in ("a:b", "0:9:0", "1:2:3:4"):
+        with pytest.raises(InputError, match="START:STOP:STEP"):
+            AnimationOptions(frames=wrong)
+
+
+def test_the_result_has_the_joints_and_clips_of_the_source(
+    small: Asset, result: tuple[AnimateResult, Path]
+) -> None:
+    _, folder = result
+    light = load(folder / "light.glb", keep_rig=True)
+    assert 0 < light.triangle_count <= QUICK["triangles"]
+    assert {n.name for n in light.rig.nodes} == {n.name for n in small.rig.nodes}
+    assert [c.name for c in light.rig.clips] == ["walk", "look"]
+    assert light.meshes[0].skin.bones.shape[1] <= 2
+    height = np.ptp(small.points(), axis=0).max()
+    for clip, time in (("walk", 0.3), ("look", 0.25)):
+        p, q = (
+            np.concatenate([pose_positions(m, pose(a, clip, time)) for m in a.meshes])
+            for a in (small, light)
+        )
+        distance = np.linalg.norm(q[:, None] - p[None], axis=2).min(axis=1)
+        assert distance.max() < 0.08 * height
+
+
+def test_the_report_tells_the_error_by_frame(result: tuple[AnimateResult, Path]) -> None:
+    made, folder = result
+    assert made.errors.frames == ("walk 0", "walk 8", "walk 16")
+    assert all(len(e) == 3 for e in (made.errors.start, made.errors.wide, made.errors.pruned))
+    assert "worst frame" in (folder / "report" / "report.html").read_text(encoding="utf-8")
+
+
+def test_what_cannot_be_animated_is_refused(small: Asset, tmp_path: Path) -> None:
+    still = bumpy_sphere(1000, 16)
+    with pytest.raises(InputError, match="no animation in it; `appearance-opt simplify`"):
+        animate(still, tmp_path / "x.glb", **QUICK)
+    with pytest.raises(InputError, match="OBJ files hold no skeleton"):
+        animate(small, tmp_path / "x.obj", **QUICK)
+    assert not list(tmp_path.iterdir())
