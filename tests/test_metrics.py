@@ -114,3 +114,17 @@ def test_equal_images_and_means_over_views() -> None:
     assert m.flip == pytest.approx(other.flip / 2)
     with pytest.raises(ValueError, match="differ in shape"):
         compare_images(a, a[:, :16])
+
+
+def test_views_are_judged_each_by_itself() -> None:
+    """Those of a batch lie side by side while FLIP looks at them."""
+    rng = np.random.default_rng(0)
+    first = rng.random((3, 40, 40, 4)).astype(np.float32)
+    first[..., 3] = 1
+    second = first * np.float32([[[[0.99, 1, 1, 1]]]])
+    second[1] = 0
+    together = compare_images(first, second)
+    for k, view in enumerate(together.views):
+        alone = compare_images(first[k : k + 1], second[k : k + 1]).views[0]
+        assert alone == view
+    assert [v.noticed for v in together.views] == [0.0, 1.0, 0.0]

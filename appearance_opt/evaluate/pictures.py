@@ -43,7 +43,8 @@ def shrink(pixels: NDArray, size: int) -> NDArray:
         return pixels
     rows, columns = (max(round(n / factor), 1) for n in (height, width))
     y, x = np.arange(rows) * height // rows, np.arange(columns) * width // columns
-    sums = np.add.reduceat(np.add.reduceat(pixels.astype(np.float64), y, 0), x, 1)
+    kind = np.float64 if pixels.dtype.kind == "f" else np.uint64
+    sums = np.add.reduceat(np.add.reduceat(pixels, y, 0, dtype=kind), x, 1)
     area = np.diff(np.append(y, height))[:, None] * np.diff(np.append(x, width))[None]
     mean = sums / area[..., None]
     return (mean if pixels.dtype.kind == "f" else np.round(mean)).astype(pixels.dtype)
