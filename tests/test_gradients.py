@@ -27,8 +27,8 @@ from appearance_opt.reference.pool import Targets
 from appearance_opt.render import gradient
 from appearance_opt.render.boundary.camera_rays import CameraRays
 from appearance_opt.render.boundary.edges import Edges
+from appearance_opt.render.boundary.estimator import Estimator
 from appearance_opt.render.boundary.pairs import Pairs
-from appearance_opt.render.boundary.seen import Estimator
 from appearance_opt.render.images import render_image
 from appearance_opt.render.pixels import Batch, Grid
 from appearance_opt.render.quality import Quality

@@ -20,7 +20,7 @@ from appearance_opt.latent.positions import POSITIONS
 from appearance_opt.optimize.losses import LOSSES
 from appearance_opt.optimize.step import Gradients
 from appearance_opt.render import gradient
-from appearance_opt.render.boundary import walk
+from appearance_opt.render.boundary import silhouette_walk
 from appearance_opt.render.boundary.camera_rays import CameraRays
 from appearance_opt.render.boundary.edges import EdgePoints, Edges
 from appearance_opt.render.boundary.intersections import Crossings, Intersections
@@ -161,7 +161,7 @@ def test_a_walk_finds_silhouettes_beyond_the_triangle_that_is_seen(
     """Why we walk: without, fine meshes lose most of their outline."""
     model, grid, views = white(ball(0)), Grid(2, 64), SAMPLER.draw(1, 2)
     every, _, _ = render(model, views, grid, PAIRS)
-    monkeypatch.setattr(walk, "LONGEST", 1)
+    monkeypatch.setattr(silhouette_walk, "LONGEST", 1)
     near, _, _ = render(model, views, grid, PAIRS)
     found = [dr.width(batch.seen.boundaries[0].pixel) for batch in (every, near)]
     assert found[1] < 0.5 * found[0]

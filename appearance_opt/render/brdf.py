@@ -39,8 +39,8 @@ class MaterialSample:
 
 
 def reflect(material: MaterialSample, n: mi.Vector3f, v: mi.Vector3f, l: mi.Vector3f) -> mi.Color3f:  # noqa: E741
-    """BRDF times the cosine of the light, for unit shading normal n, directions to viewer v and
-    light l.
+    """Return the BRDF times the cosine of the light, for unit shading normal n, directions to
+    viewer v and light l.
 
     Zero where the light is below the shading horizon. Reflectance per steradian (linear RGB).
     """

@@ -36,7 +36,8 @@ def camera_of(records: mi.Float, view: mi.UInt32) -> Camera:
 
 
 def direction(camera: Camera, x: mi.Float, y: mi.Float, resolution: mi.Float) -> mi.Vector3f:
-    """Direction of the ray through pixel position (x, y); its component along ``forward`` is 1."""
+    """Return the direction of the ray through pixel position (x, y); its component along
+    ``forward`` is 1."""
     scale = 2 / resolution
     return camera.forward + camera.right * dr.fma(x, scale, -1) + camera.down * dr.fma(y, scale, -1)
 
@@ -44,7 +45,8 @@ def direction(camera: Camera, x: mi.Float, y: mi.Float, resolution: mi.Float) ->
 def project(
     camera: Camera, p: mi.Point3f, resolution: mi.Float
 ) -> tuple[mi.Float, mi.Float, mi.Float]:
-    """Pixel position (x, y) and depth along ``forward`` of world points. Differentiable in p."""
+    """Return the pixel position (x, y) and depth along ``forward`` of world points. Differentiable
+    in p."""
     v = p - camera.eye
     depth = dr.dot(v, camera.forward)
     half = 0.5 * resolution

@@ -16,8 +16,8 @@ BACKGROUND = 0.18
 
 
 def display(image: NDArray) -> NDArray[np.float32]:
-    """(..., 4) premultiplied linear radiance and coverage to (..., 3) sRGB values in [0, 1] over
-    grey."""
+    """Turn (..., 4) premultiplied linear radiance and coverage to (..., 3) sRGB values in [0, 1]
+    over grey."""
     return linear_to_srgb(
         np.clip(image[..., :3] + BACKGROUND * (1 - image[..., 3:]), 0, 1).astype(np.float32)
     )

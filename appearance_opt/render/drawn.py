@@ -49,6 +49,6 @@ class Drawn:
 
     @property
     def shown(self) -> Shown:
-        """What stages that trace no ray are handed: the scene costs time in every call of a
+        """Return what stages that trace no ray are handed: the scene costs time in every call of a
         recorded one."""
         return Shown(self.surface, self.maps, self.edges)

@@ -35,7 +35,7 @@ class EdgeList:
 
 
 def edge_list(faces: NDArray, culled: NDArray | None = None) -> EdgeList:
-    """All edges of a welded mesh (F, 3). ``culled`` (F,): see ``Surface.culled``."""
+    """List all edges of a welded mesh (F, 3). ``culled`` (F,): see ``Surface.culled``."""
     low, high, opposite, order, heads, uses = _sorted_edges(faces)
     second = np.minimum(heads + 1, len(low) - 1)
     other = np.where(uses == 2, opposite[second], high[heads])
@@ -50,7 +50,7 @@ def edge_list(faces: NDArray, culled: NDArray | None = None) -> EdgeList:
 
 
 def walkable(edges: EdgeList, faces: NDArray) -> EdgeList:
-    """The same edges of the same faces (F, 3), with what lies around each face."""
+    """Return the same edges of the same faces (F, 3), with what lies around each face."""
     _, _, _, order, heads, uses = _sorted_edges(faces)
     count = len(faces)
     face, edge = order % count, np.repeat(np.arange(len(heads)), uses)

@@ -58,7 +58,7 @@ class Frozen:
                 gc.enable()
 
     def recordings(self) -> int:
-        """Recordings made so far."""
+        """Count the recordings made so far."""
         return sum(f.n_recordings for f in self._frozen.values())
 
 
@@ -73,12 +73,12 @@ def _interrupted(error: BaseException | None) -> bool:
 
 
 def traced(function: Callable, *arguments: Any) -> Any:
-    """The plain call, in place of a ``Frozen``."""
+    """Call plainly, in place of a ``Frozen``."""
     return function(*arguments)
 
 
 def arrays_in(*owners: object) -> list:
-    """All Dr.Jit arrays that objects hold, in containers, data classes and attributes, each
+    """List all Dr.Jit arrays that objects hold, in containers, data classes and attributes, each
     once."""
     found: list = []
     seen: set[int] = set()

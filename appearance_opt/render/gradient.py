@@ -10,8 +10,8 @@ everything but the surface's buffers held fixed. The image itself is never diffe
 samples and boundaries there are is up to ``Quality.visibility`` (see ``boundary``).
 
 Most pixels hold no boundary, and a few samples: their colour is the mean of these. When the loss is
-a sum over pixels, ``Sampling.defer`` leaves them out, and ``direct`` shades them, takes the loss and
-goes back in one kernel: half the work.
+a sum over pixels, ``Sampling.defer`` leaves them out, and ``direct`` shades them, takes the loss
+and goes back in one kernel: half the work.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ import mitsuba as mi
 
 # not only for the type checker: Dr.Jit resolves the annotations of data classes when it looks for
 # arrays
-from appearance_opt.render.boundary.seen import Seen
+from appearance_opt.render.boundary.estimator import Seen
 from appearance_opt.render.freezing import traced
 from appearance_opt.render.passing import MISS
 from appearance_opt.render.pixels import Batch, add_colors
@@ -34,7 +34,7 @@ from appearance_opt.render.shading import shade
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from appearance_opt.render.boundary.seen import Boundary
+    from appearance_opt.render.boundary.estimator import Boundary
     from appearance_opt.render.drawn import Drawn, Shown
     from appearance_opt.render.freezing import Run
     from appearance_opt.render.quality import Quality
@@ -55,7 +55,7 @@ class RenderedBatch:
     seen: Seen
 
     def complete(self) -> mi.Bool | None:
-        """(pixels,) which pixels of the image are not deferred; None if none is."""
+        """Mark (pixels,) which pixels of the image are not deferred; None if none is."""
         if self.seen.whole is None:
             return None
         out = dr.full(mi.Bool, True, self.batch.grid.pixels)
@@ -66,8 +66,8 @@ class RenderedBatch:
 def render(
     drawn: Drawn, batch: Batch, quality: Quality, seed: int, run: Run = traced
 ) -> RenderedBatch:
-    """Forward pass, without gradients (``drawn`` is read detached). ``run``: how its stages are
-    called (see ``freezing``)."""
+    """Run the forward pass, without gradients (``drawn`` is read detached). ``run``: how its stages
+    are called (see ``freezing``)."""
     with dr.suspend_grad():
         seen = quality.visibility.see(drawn, batch, quality, seed, run)
         image, contrasts = run(_averages, drawn.shown, batch, seen)
@@ -97,8 +97,8 @@ def direct(
     shown: Shown,
     pixel_loss: Callable[[mi.Color3f, mi.UInt32], mi.Float],
 ) -> mi.Float | None:
-    """Loss of each deferred pixel, differentiable: ``pixel_loss(radiance, pixel)`` of its radiance
-    (all deferred pixels are fully covered). None without any."""
+    """Return the loss of each deferred pixel, differentiable: ``pixel_loss(radiance, pixel)`` of
+    its radiance (all deferred pixels are fully covered). None without any."""
     if (whole := rendered.seen.whole) is None:
         return None
     colors = [shade(shown, rendered.batch, r, whole.width) for r in whole.rays]
@@ -106,8 +106,8 @@ def direct(
 
 
 def surrogate(rendered: RenderedBatch, shown: Shown, image_gradient: mi.Float) -> list[mi.Float]:
-    """Arrays whose sums have the loss's derivative, for ``image_gradient`` = dLoss/dImage (pixels *
-    4).
+    """Return arrays whose sums have the loss's derivative, for ``image_gradient`` = dLoss/dImage
+    (pixels * 4).
 
     Only their gradients mean anything: pass them to ``backward``. They are not summed here, as a
     sum would evaluate them and make the backward pass shade once more. Empty when the batch is.

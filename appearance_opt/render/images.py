@@ -72,14 +72,14 @@ class Resolve(Protocol):
         footprint: Footprint,
         run: Run,
     ) -> mi.Float:
-        """The image (pixels * 4) and what one ray in every pixel has ``seen``."""
+        """Add to the image (pixels * 4) what one ray in every pixel has ``seen``."""
         ...
 
 
 def add_first(
     image: mi.Float, drawn: Drawn, batch: Batch, seen: Visible, footprint: Footprint, run: Run
 ) -> mi.Float:
-    """Of opaque surfaces: what rays meet first. See ``Resolve``."""
+    """Add what rays meet first. See ``Resolve``."""
     shaded = seen.samples, dr.compress(seen.hit)
     # one sample per pixel: no two threads meet
     return _add_shaded(image, drawn.shown, batch, shaded, footprint, dr.ReduceMode.NoConflicts, run)
@@ -93,10 +93,11 @@ def render_image(
     run: Run = traced,
     resolve: Resolve = add_first,
 ) -> mi.Float:
-    """A whole batch of images with ``samples`` samples in every pixel, without gradients. Textures
-    are filtered over ``width`` pixels; by default over the whole pixel where it has one sample, and
-    by the samples alone where it has several: mip levels of normal maps are flatter than what they
-    stand for, and shine in other places. ``run``: how its stages are called (see ``freezing``).
+    """Draw a whole batch of images with ``samples`` samples in every pixel, without gradients.
+    Textures are filtered over ``width`` pixels; by default over the whole pixel where it has one
+    sample, and by the samples alone where it has several: mip levels of normal maps are flatter
+    than what they stand for, and shine in other places. ``run``: how its stages are called (see
+    ``freezing``).
 
     Returns (pixels * 4) premultiplied linear radiance and coverage. One sample of all pixels at a
     time, so that memory does not grow with ``samples``.
@@ -111,7 +112,7 @@ def render_image(
 def render_pair(
     drawn: Drawn, batch: Batch, samples: int, width: float, run: Run = traced
 ) -> tuple[mi.Float, mi.Float]:
-    """(average, points): two images of the same views. ``points`` is what the ray through the
+    """Draw (average, points): two images of the same views. ``points`` is what the ray through the
     middle of each pixel sees, textures filtered over ``width`` pixels; ``average`` is the same away
     from outlines, and the mean of ``samples`` rays at them. Costs a fraction of ``samples`` full
     images. ``run``: as in ``render_image``."""

@@ -9,9 +9,9 @@ import numpy as np
 
 @cache
 def sub_pixel_offsets(count: int) -> np.ndarray:
-    """(count, 2) well-spread positions in the unit square: the rank-1 lattice (i, g i) / count
-    whose points lie farthest apart (on the torus), placed so that it is symmetric about the middle
-    of the pixel.
+    """Return (count, 2) well-spread positions in the unit square: the rank-1 lattice (i, g i) /
+    count whose points lie farthest apart (on the torus), placed so that it is symmetric about the
+    middle of the pixel.
 
     Without the symmetry the image is shifted by the distance of the points' mean from the middle
     (docs/trials.md: images).
@@ -26,7 +26,7 @@ def sub_pixel_offsets(count: int) -> np.ndarray:
 
 @cache
 def generator(count: int) -> int:
-    """g of the lattice."""
+    """Return g of the lattice."""
     i = np.arange(count)
     best, found = -1.0, 1
     for g in range(1, max(count, 2)):

@@ -53,7 +53,7 @@ class Coverage:
     layer: TexelLayer
 
     def at(self, hit: Hit) -> mi.Float:
-        """Share in [0, 1] at each hit."""
+        """Return the share in [0, 1] at each hit."""
         share, cutoff = self.layer.at(hit)[:2]
         if hit.alpha is not None:
             share *= hit.alpha
@@ -95,8 +95,8 @@ class SeenThrough:
         footprint: Footprint,
         run: Run,
     ) -> mi.Float:
-        """All layers along the rays, from the eye on; see ``images.Resolve``. Rays whose light is
-        used up take no part in further layers."""
+        """Add all layers along the rays, from the eye on; see ``images.Resolve``. Rays whose light
+        is used up take no part in further layers."""
         shown, light = drawn.shown, dr.ones(mi.Float, dr.width(seen.depth))
         dr.eval(light)
         for _ in range(MOST):
@@ -144,8 +144,8 @@ def _accumulate(
     layer: tuple[Samples, mi.UInt32, mi.Float],
     footprint: Footprint,
 ) -> mi.Float:
-    """The image with a ``layer``, one sample at most per pixel: samples, the positions in their list
-    of those that count, and the share of their rays' light that each of the list keeps back."""
+    """The image with a ``layer``, one sample at most per pixel: samples, the positions in their
+    list of those that count, and the share of its ray's light that each of the list keeps back."""
     samples, index, share = layer
     some = samples.keep(index)
     color, out = shade(shown, batch, some, footprint.width), mi.Float(image)

@@ -45,11 +45,11 @@ class TexelLayer:
     pyramid: Pyramid
 
     def with_texels(self, texels: mi.Float) -> TexelLayer:
-        """The same layer around other texels."""
+        """Return the same layer around other texels."""
         return TexelLayer(self.channels, self.pyramid.with_texels(texels))
 
     def at(self, hit: Hit) -> list:
-        """Values of all channels at each hit, padding included."""
+        """Look up the values of all channels at each hit, padding included."""
         material = hit.material if len(self.pyramid.layout.sizes) > 1 else None
         return self.pyramid.lookup(material, hit.uv, hit.footprint)
 
@@ -71,7 +71,7 @@ class MaterialMaps:
 
 
 def evaluate(maps: MaterialMaps, hit: Hit) -> MaterialSample:
-    """Material at each hit."""
+    """Look up the material at each hit."""
     value: dict[str, mi.Float] = {k: mi.Float(v) for k, v in {**DEFAULTS, **maps.constants}.items()}
     for layer in maps.layers:
         value.update(zip(layer.channels, layer.at(hit), strict=False))
@@ -88,8 +88,8 @@ def evaluate(maps: MaterialMaps, hit: Hit) -> MaterialSample:
 
 
 def shading_normal(hit: Hit, sample: MaterialSample) -> mi.Vector3f:
-    """World-space shading normal: the normal map in the hit's interpolated tangent basis (glTF 2.0,
-    3.9.3)."""
+    """Return the world-space shading normal: the normal map in the hit's interpolated tangent basis
+    (glTF 2.0, 3.9.3)."""
     if sample.normal is None or hit.tangent is None:
         return hit.normal
     bitangent = dr.cross(hit.normal, hit.tangent) * hit.handedness

@@ -17,22 +17,22 @@ LARGEST_HALF = 65504.0
 
 
 def at_least(x: mi.Float, low: float | mi.Float) -> mi.Float:
-    """max(x, low); the gradient is zero below."""
+    """Return max(x, low); the gradient is zero below."""
     return dr.fmax(x, low)
 
 
 def at_most(x: mi.Float, high: float | mi.Float) -> mi.Float:
-    """min(x, high); the gradient is zero above."""
+    """Return min(x, high); the gradient is zero above."""
     return dr.fmin(x, high)
 
 
 def clamp(x: mi.Float, low: float | mi.Float, high: float | mi.Float) -> mi.Float:
-    """x brought into [low, high]; the gradient is zero outside."""
+    """Bring x into [low, high]; the gradient is zero outside."""
     return dr.fmin(dr.fmax(x, low), high)
 
 
 def unit(v: mi.Vector3f) -> mi.Vector3f:
-    """v / |v|, and zero with a zero gradient where v is (nearly) zero."""
+    """Return v / |v|, and zero with a zero gradient where v is (nearly) zero."""
     squared = dr.squared_norm(v)
     ok = squared > 1e-30
     return dr.select(ok, v * dr.rsqrt(dr.select(ok, squared, 1)), 0)
@@ -46,8 +46,8 @@ ARC_TANGENT = (
 
 
 def angle_of(sine: mi.Float, cosine: mi.Float) -> mi.Float:
-    """Angle in [0, pi] of a sine that is positive and a cosine, both up to a common factor:
-    ``dr.atan2`` is built on the minimum and maximum that propagate NaNs."""
+    """Return the angle in [0, pi] of a sine that is positive and a cosine, both up to a common
+    factor: ``dr.atan2`` is built on the minimum and maximum that propagate NaNs."""
     across = dr.abs(cosine)
     steep = sine > across
     t = dr.select(steep, across, sine) / dr.select(steep, sine, across)

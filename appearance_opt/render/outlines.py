@@ -17,8 +17,8 @@ NOTHING = 1e30
 
 
 def find(depth: mi.Float, pixel: mi.UInt32, rows: mi.UInt32, pixels: int) -> mi.Bool:
-    """(pixels,) which pixels are at an outline. ``depth`` of every pixel, of which ``pixel`` is the
-    index in the batch: (view, row, column) of images of ``rows`` rows and columns."""
+    """Mark (pixels,) which pixels are at an outline. ``depth`` of every pixel, of which ``pixel``
+    is the index in the batch: (view, row, column) of images of ``rows`` rows and columns."""
     image = dr.empty(mi.Float, pixels)
     dr.scatter(image, depth, pixel, mode=dr.ReduceMode.Permute)
     dr.eval(image)

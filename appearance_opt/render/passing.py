@@ -80,9 +80,10 @@ def meet(
     active: mi.Bool | bool = True,
     coherent: bool = False,
 ) -> Met:
-    """What rays see: the nearest face, within ``ray.maxt``, that does not turn its back to them (if
-    it is single-sided) and that ``counts`` (all by default), farther than ``after`` along the ray
-    (from its origin on by default). ``coherent``: as in Mitsuba. Directions are unit vectors."""
+    """Find what rays see: the nearest face, within ``ray.maxt``, that does not turn its back to
+    them (if it is single-sided) and that ``counts`` (all by default), farther than ``after`` along
+    the ray (from its origin on by default). ``coherent``: as in Mitsuba. Directions are unit
+    vectors."""
     if counts is None and after is None and not isinstance(scene, SidedScene):
         hit = scene.ray_intersect_preliminary(ray, coherent=coherent, active=active)
         return Met(
@@ -93,9 +94,9 @@ def meet(
 
 
 def blocked(scene: Scene, ray: mi.Ray3f, active: mi.Bool | bool = True) -> mi.Bool:
-    """Does anything hide the origin of rays from someone at their far end, looking back? What
-    stands in the way is seen from there: a single-sided face that turns its front to the origin
-    hides nothing."""
+    """Tell whether anything hides the origin of rays from someone at their far end, looking back.
+    What stands in the way is seen from there: a single-sided face that turns its front to the
+    origin hides nothing."""
     if not isinstance(scene, SidedScene):
         return scene.ray_test(ray, active=active)
     out = mi.Bool(False)
@@ -105,18 +106,18 @@ def blocked(scene: Scene, ray: mi.Ray3f, active: mi.Bool | bool = True) -> mi.Bo
 
 
 def parts_of(scene: Scene) -> list[mi.Scene | Half]:
-    """The scenes to be searched one by one."""
+    """List the scenes to be searched one by one."""
     return list(scene.halves) if isinstance(scene, SidedScene) else [scene]
 
 
 def scene_in(part: mi.Scene | Half) -> mi.Scene:
-    """The Mitsuba scene of one part of a scene."""
+    """Return the Mitsuba scene of one part of a scene."""
     return part.scene if isinstance(part, Half) else part
 
 
 def numbers_of(part: mi.Scene | Half, prim: mi.UInt32, valid: mi.Bool) -> mi.UInt32:
-    """Numbers in the whole mesh of the triangles ``prim`` of one part of a scene; ``MISS`` where
-    not ``valid``."""
+    """Return the numbers in the whole mesh of the triangles ``prim`` of one part of a scene;
+    ``MISS`` where not ``valid``."""
     number = dr.gather(mi.UInt32, part.triangle, prim, valid) if isinstance(part, Half) else prim
     return dr.select(valid, number, MISS)
 

@@ -40,8 +40,8 @@ class Grid:
         self._finer: dict[int, Grid] = {}
 
     def finer(self, factor: int) -> Grid:
-        """``factor`` squared points in every pixel, as a grid of their own; made when first asked
-        for."""
+        """Return ``factor`` squared points in every pixel, as a grid of their own; made when first
+        asked for."""
         if factor == 1:
             return self
         if factor not in self._finer:
@@ -68,7 +68,7 @@ class Batch:
 
 
 def pixel_grid(views: int, resolution: int) -> tuple[mi.UInt32, mi.UInt32, mi.UInt32]:
-    """(view, column, row) of every pixel of a batch, tile by tile."""
+    """List (view, column, row) of every pixel of a batch, tile by tile."""
     padded = -(-resolution // TILE)
     i = dr.arange(mi.UInt32, views * padded * padded * TILE * TILE)
     inside = i & (TILE * TILE - 1)
@@ -97,6 +97,6 @@ def add_colors(
 
 
 def pixel_index(samples: Samples, resolution: mi.UInt32) -> mi.UInt32:
-    """Index of the pixel of each sample in the batch: (view, row, column), row major."""
+    """Return the index of the pixel of each sample in the batch: (view, row, column), row major."""
     column, row = mi.UInt32(samples.x), mi.UInt32(samples.y)
     return (samples.view * resolution + row) * resolution + column

@@ -6,7 +6,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from appearance_opt.render.boundary.camera_rays import CameraRays
-from appearance_opt.render.boundary.seen import Estimator
+from appearance_opt.render.boundary.estimator import Estimator
 from appearance_opt.render.sampling import Sampling
 
 

@@ -39,8 +39,8 @@ NOTHING = 0xFFFFFFFFFFFFFFFF
 
 
 def drawing_is_faster(surface: Surface, grid: Grid) -> bool:
-    """Is drawing the surface faster than tracing rays? Not known of GPUs, which have hardware for
-    rays."""
+    """Tell whether drawing the surface is faster than tracing rays. Not known of GPUs, which have
+    hardware for rays."""
     triangles = dr.width(surface.faces) // 4
     return mi.variant() == backend.CPU and triangles <= MOST_PER_PIXEL * grid.resolution**2
 
@@ -48,7 +48,7 @@ def drawing_is_faster(surface: Surface, grid: Grid) -> bool:
 def draw_grid(
     surface: Surface, batch: Batch, dx: mi.Float, dy: mi.Float
 ) -> tuple[Samples, mi.Float]:
-    """What the surface shows at the offset (dx, dy) in every pixel, and its depth (see
+    """Find what the surface shows at the offset (dx, dy) in every pixel, and its depth (see
     ``rays.trace_grid``). Of triangles at exactly the same depth the first is seen."""
     grid = batch.grid
     projected = _project(surface.vertices, batch)

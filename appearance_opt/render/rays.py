@@ -20,14 +20,14 @@ if TYPE_CHECKING:
 
 
 def trace(scene: Scene, batch: Batch, view: mi.UInt32, x: mi.Float, y: mi.Float) -> Samples:
-    """What camera rays through pixel positions (x, y) of the given views see."""
+    """Find what camera rays through pixel positions (x, y) of the given views see."""
     return trace_depth(scene, batch, view, x, y)[0]
 
 
 def trace_depth(
     scene: Scene, batch: Batch, view: mi.UInt32, x: mi.Float, y: mi.Float
 ) -> tuple[Samples, mi.Float]:
-    """The same, and the depth of the hits along ``forward`` (infinite for a miss)."""
+    """Find the same, and the depth of the hits along ``forward`` (infinite for a miss)."""
     camera = camera_of(batch.records, view)
     d = direction(camera, x, y, batch.grid.size)
     inverse_length = dr.rsqrt(dr.squared_norm(d))
@@ -38,7 +38,8 @@ def trace_depth(
 def trace_grid(
     scene: Scene, batch: Batch, dx: mi.Float | float = 0.5, dy: mi.Float | float = 0.5
 ) -> tuple[Samples, mi.Float]:
-    """The same of one ray in every pixel, at the offset (dx, dy): by default through its middle."""
+    """Find the same of one ray in every pixel, at the offset (dx, dy): by default through its
+    middle."""
     grid = batch.grid
     return trace_depth(scene, batch, grid.view, mi.Float(grid.column) + dx, mi.Float(grid.row) + dy)
 
@@ -46,8 +47,8 @@ def trace_grid(
 def trace_pixels(
     scene: Scene, batch: Batch, index: mi.UInt32, count: int, run: Run = traced
 ) -> tuple[Samples, mi.Bool]:
-    """``count`` rays in each of the pixels at the positions ``index`` of the grid, those of a pixel
-    one after the other, and whether each hits."""
+    """Trace ``count`` rays in each of the pixels at the positions ``index`` of the grid, those of a
+    pixel one after the other, and whether each hits."""
     if dr.width(index) == 0:
         return Samples(mi.UInt32(), mi.Float(), mi.Float(), mi.UInt32()), mi.Bool()
     ray = dr.arange(mi.UInt32, dr.width(index) * count)

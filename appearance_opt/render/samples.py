@@ -22,7 +22,7 @@ class Samples:
     triangle: mi.UInt32
 
     def keep(self, index: mi.UInt32) -> Samples:
-        """The samples at the given positions of the list."""
+        """Take the samples at the given positions of the list."""
         return Samples(
             dr.gather(mi.UInt32, self.view, index),
             dr.gather(mi.Float, self.x, index),
@@ -53,7 +53,7 @@ class Whole:
 
 
 def concat(parts: list[Samples]) -> Samples:
-    """Lists of samples one after the other."""
+    """Put lists of samples one after the other."""
     if len(parts) == 1:
         return parts[0]
     return Samples(
@@ -62,8 +62,8 @@ def concat(parts: list[Samples]) -> Samples:
 
 
 def join_arrays(parts: list[mi.Float]) -> mi.Float:
-    """Arrays one after the other. ``dr.concat`` would write their widths, which change every step,
-    into the kernel and so compile one every step."""
+    """Put arrays one after the other. ``dr.concat`` would write their widths, which change every
+    step, into the kernel and so compile one every step."""
     out = dr.empty(type(parts[0]), sum(dr.width(p) for p in parts))
     offset = 0
     for part in parts:

@@ -27,8 +27,8 @@ that touches a surface is infinitely bright there."""
 
 
 def shade(shown: Shown, batch: Batch, samples: Samples, width: mi.Float) -> mi.Color3f:
-    """Radiance towards the camera at each sample (all must be hits). Linear RGB. ``width``: width
-    of a sample in pixels, which selects the mip level."""
+    """Return the radiance towards the camera at each sample (all must be hits). Linear RGB.
+    ``width``: width of a sample in pixels, which selects the mip level."""
     camera = camera_of(batch.records, samples.view)
     hit = interpolate(shown.surface, camera, samples, batch.grid.size, width)
     sample = material.evaluate(shown.maps, hit)

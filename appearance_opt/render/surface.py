@@ -70,7 +70,7 @@ class Hit:
 def interpolate(
     surface: Surface, camera: Camera, samples: Samples, resolution: mi.Float, width: mi.Float
 ) -> Hit:
-    """Attributes where the camera rays of ``samples`` (all hits) meet their triangles.
+    """Interpolate attributes where the camera rays of ``samples`` (all hits) meet their triangles.
 
     Barycentric coordinates are recomputed from the vertex positions (Moeller and Trumbore 1997), so
     that gradients flow to the positions: the ray stands still, the surface moves under it.
@@ -115,8 +115,8 @@ def interpolate(
 def interpolate_at(
     surface: Surface, triangle: mi.UInt32, b1: mi.Float, b2: mi.Float, area: mi.Float
 ) -> Hit:
-    """Attributes at barycentric points of triangles, seen from outside; ``area`` of the patch that
-    a point stands for, in world units squared. ``to_viewer`` is zero."""
+    """Interpolate attributes at barycentric points of triangles, seen from outside; ``area`` of the
+    patch that a point stands for, in world units squared. ``to_viewer`` is zero."""
     here = _gather(surface, triangle)
     p = here.positions
     facing = dr.cross(p[1] - p[0], p[2] - p[0])
@@ -127,7 +127,7 @@ def interpolate_at(
 
 
 def face_normal(surface: Surface, triangle: mi.UInt32, active: mi.Bool) -> mi.Vector3f:
-    """Normal of triangles by their winding, not normalised; zero where inactive."""
+    """Return the normal of triangles by their winding, not normalised; zero where inactive."""
     face = dr.gather(mi.ArrayXu, surface.faces, triangle, active, shape=(4, dr.width(triangle)))
     p = []
     for k in range(3):
@@ -139,7 +139,7 @@ def face_normal(surface: Surface, triangle: mi.UInt32, active: mi.Bool) -> mi.Ve
 
 
 def vertex_position(surface: Surface, index: mi.UInt32) -> mi.Point3f:
-    """Positions of vertices; differentiable."""
+    """Gather the positions of vertices; differentiable."""
     v = _packet(surface.vertices, index, 8)
     return mi.Point3f(v[0], v[1], v[2])
 
@@ -216,7 +216,8 @@ def interpolate_packets(
     b2: mi.Float,
     channels: int,
 ) -> list[mi.Float]:
-    """Values per vertex (packets of ``channels``) at barycentric points of triangles."""
+    """Interpolate values per vertex (packets of ``channels``) at barycentric points of
+    triangles."""
     n = dr.width(triangle)
     face = dr.gather(mi.ArrayXu, surface.faces, triangle, shape=(4, n))
     rows = [dr.gather(mi.ArrayXf, values, face[k], shape=(channels, n)) for k in range(3)]

@@ -69,8 +69,8 @@ class PyramidLayout:
 def pyramid_layout(
     sizes: Sequence[tuple[int, int]], channels: int, wraps: Sequence[int], max_levels: int = 16
 ) -> PyramidLayout:
-    """Layout for materials whose base levels have the given (width, height). A level is half its
-    parent, rounded up, down to 1 x 1 or ``max_levels`` levels."""
+    """Lay out levels for materials whose base levels have the given (width, height). A level is
+    half its parent, rounded up, down to 1 x 1 or ``max_levels`` levels."""
     chains = []
     for width, height in sizes:
         chain = [(width, height)]
@@ -102,7 +102,7 @@ class Pyramid:
 
     @classmethod
     def of(cls, layout: PyramidLayout, texels: mi.Float) -> Pyramid:
-        """A pyramid with the table of its layout."""
+        """Make a pyramid with the table of its layout."""
         table = np.zeros((len(layout.sizes), layout.levels, 4), np.uint32)
         for m, (sizes, offsets, wrap) in enumerate(
             zip(layout.sizes, layout.offsets, layout.wraps, strict=True)
@@ -112,11 +112,11 @@ class Pyramid:
         return cls(layout, texels, mi.UInt32(table.ravel()))
 
     def with_texels(self, texels: mi.Float) -> Pyramid:
-        """The same layout around other texels (no copy of the table)."""
+        """Return the same layout around other texels (no copy of the table)."""
         return replace(self, texels=texels)
 
     def lookup(self, material: mi.UInt32 | None, uv: mi.Point2f, footprint: mi.Float) -> list:
-        """Trilinear lookup.
+        """Look up trilinearly.
 
         ``material``: index per sample, or None when there is only one. ``footprint``: area that a
         sample covers in UV space (a fraction of the unit square); it selects the level at which one
@@ -204,7 +204,8 @@ def _modulo(i: mi.Int32, size: mi.Int32) -> mi.Int32:
 
 
 def downsample(texels: mi.Float, size: tuple[int, int], channels: int) -> mi.Float:
-    """Next mip level of one (width, height) level: the mean of 2 x 2 texels (edges clamp)."""
+    """Make the next mip level of one (width, height) level: the mean of 2 x 2 texels (edges
+    clamp)."""
     width, height = size
     half_w, half_h = (width + 1) // 2, (height + 1) // 2
     i = dr.arange(mi.UInt32, half_w * half_h)

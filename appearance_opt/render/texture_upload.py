@@ -33,7 +33,7 @@ class Base:
 
     @classmethod
     def of(cls, texels: NDArray[np.float32]) -> Base:
-        """Of texels (H, W, channels) that are there."""
+        """Make it of texels (H, W, channels) that are there."""
         return cls(
             texels.shape[1],
             texels.shape[0],
@@ -48,10 +48,10 @@ def build_pyramid(
     max_levels: int = 16,
     kind: type[np.floating] = np.float32,
 ) -> Pyramid:
-    """Pyramid of the textures of several materials, made on the host: of what no one fits.
-    ``kind``: float32, or float16 (11 bits) for half the memory, which is what lookups wait for;
-    base levels are never held in single precision then, which for a map of 8192^2 texels would take
-    two gigabytes."""
+    """Build the pyramid of the textures of several materials, made on the host: of what no one
+    fits. ``kind``: float32, or float16 (11 bits) for half the memory, which is what lookups wait
+    for; base levels are never held in single precision then, which for a map of 8192^2 texels would
+    take two gigabytes."""
     channels = bases[0].channels
     layout = pyramid_layout([(b.width, b.height) for b in bases], channels, wraps, max_levels)
     flat = np.empty((layout.texel_count, channels), kind)

@@ -46,7 +46,7 @@ class MeshArrays:
 
 
 def surface_of(mesh: MeshArrays) -> Surface:
-    """The mesh, ready to be shaded."""
+    """Upload the mesh, ready to be shaded."""
     frames = None
     if mesh.uvs is not None and mesh.tangents is None:
         frames = packets(2, mesh.uvs)
@@ -65,8 +65,8 @@ def surface_of(mesh: MeshArrays) -> Surface:
 
 
 def scene_of(positions: NDArray, faces: NDArray, culled: NDArray | None = None) -> Scene:
-    """What rays through one triangle mesh are traced in: a Mitsuba scene (Embree or OptiX), or,
-    with faces that are ``culled`` (F,) when seen from behind, two of them."""
+    """Make what rays through one triangle mesh are traced in: a Mitsuba scene (Embree or OptiX),
+    or, with faces that are ``culled`` (F,) when seen from behind, two of them."""
     if culled is None:
         return mi.load_dict({"type": "scene", "mesh": _mesh_of(positions, faces)})
     normals = _normals(positions, faces)
@@ -169,7 +169,7 @@ def _mesh_of(positions: NDArray, faces: NDArray) -> mi.Mesh:
 
 
 def index_packets(triples: NDArray, fourth: NDArray | int = 0) -> mi.UInt32:
-    """(F, 3) indices and a fourth number as packets of four."""
+    """Pack (F, 3) indices and a fourth number as packets of four."""
     out = np.empty((len(triples), 4), np.uint32)
     out[:, :3] = triples
     out[:, 3] = fourth
@@ -177,7 +177,7 @@ def index_packets(triples: NDArray, fourth: NDArray | int = 0) -> mi.UInt32:
 
 
 def packets(channels: int, *columns: NDArray) -> mi.Float:
-    """Columns (N, k) side by side, padded with zeros to ``channels`` floats per row."""
+    """Pack columns (N, k) side by side, padded with zeros to ``channels`` floats per row."""
     rows = np.zeros((len(columns[0]), channels), np.float32)
     start = 0
     for column in columns:

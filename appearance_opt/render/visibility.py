@@ -28,7 +28,7 @@ class Visible:
     hit: mi.Bool
 
     def keep(self, index: mi.UInt32) -> Visible:
-        """Those at the given positions of the list."""
+        """Take those at the given positions of the list."""
         return Visible(
             self.samples.keep(index),
             dr.gather(mi.Float, self.depth, index),
@@ -37,7 +37,7 @@ class Visible:
 
 
 def see_grid(drawn: Drawn, batch: Batch, dx: float, dy: float, run: Run) -> Visible:
-    """What one ray in every pixel sees, at the offset (dx, dy)."""
+    """Find what one ray in every pixel sees, at the offset (dx, dy)."""
     offset = dr.opaque(mi.Float, dx), dr.opaque(mi.Float, dy)
     if raster.drawing_is_faster(drawn.surface, batch.grid):
         samples, depth = run(raster.draw_grid, drawn.surface, batch, *offset)

@@ -26,9 +26,9 @@ import numpy as np
 from appearance_opt import backend
 from appearance_opt.render.boundary.camera_rays import CameraRays
 from appearance_opt.render.boundary.edges import Edges
+from appearance_opt.render.boundary.estimator import Finder
 from appearance_opt.render.boundary.intersections import Intersections
 from appearance_opt.render.boundary.pairs import Pairs
-from appearance_opt.render.boundary.seen import Finder
 from appearance_opt.render.quality import Quality
 from experiments import mitsuba_peer
 from experiments.gradient_error.estimators import Ours

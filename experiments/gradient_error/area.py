@@ -24,7 +24,7 @@ from appearance_opt.latent.mesh import LatentMesh
 from appearance_opt.latent.parameter import Rates
 from appearance_opt.latent.positions import POSITIONS
 from appearance_opt.render import gradient
-from appearance_opt.render.boundary import edges, walk
+from appearance_opt.render.boundary import edges, silhouette_walk
 from appearance_opt.render.boundary.camera_rays import CameraRays
 from appearance_opt.render.boundary.edges import Edges
 from appearance_opt.render.boundary.pairs import Pairs
@@ -42,7 +42,7 @@ SETTINGS: dict[str, tuple[Quality, tuple]] = {
     "the same, side rays at 1e-3 pixels": (EDGES, (edges, "OFFSET", 1e-3 / RESOLUTION)),
     "the same, side rays at 1e-2 pixels": (EDGES, (edges, "OFFSET", 1e-2 / RESOLUTION)),
     "pairs": (PAIRS, ()),
-    "pairs without a walk": (PAIRS, (walk, "LONGEST", 1)),
+    "pairs without a walk": (PAIRS, (silhouette_walk, "LONGEST", 1)),
     "pairs, 2 x 2": (Quality(4, visibility=Pairs()), ()),
 }
 

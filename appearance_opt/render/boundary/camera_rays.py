@@ -10,7 +10,7 @@ import mitsuba as mi
 
 from appearance_opt.render import rays
 from appearance_opt.render.boundary.edges import Edges
-from appearance_opt.render.boundary.seen import Estimator, Finder, Seen, changed_pixels
+from appearance_opt.render.boundary.estimator import Estimator, Finder, Seen, changed_pixels
 from appearance_opt.render.pixels import pixel_index
 from appearance_opt.render.samples import Samples, Weighted, Whole, concat, join_arrays
 from appearance_opt.render.visibility import see_grid
@@ -24,8 +24,8 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class CameraRays(Estimator):
-    """``finders``: what looks for boundaries (without any, visibility has no gradient); ``samples``:
-    camera rays in each pixel that a boundary crosses, spread over its area."""
+    """``finders``: what looks for boundaries (without any, visibility has no gradient);
+    ``samples``: camera rays in each pixel that a boundary crosses, spread over its area."""
 
     finders: tuple[Finder, ...] = (Edges(),)
     samples: int = 8

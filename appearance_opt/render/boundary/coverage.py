@@ -19,8 +19,8 @@ from appearance_opt.render.math import at_least, at_most
 
 
 def half_plane_area(nx: mi.Float, ny: mi.Float, distance: mi.Float) -> mi.Float:
-    """Area of the part of the unit square about the origin where n . p < distance, for a unit
-    vector n."""
+    """Return the area of the part of the unit square about the origin where n . p < distance, for a
+    unit vector n."""
     a, b = dr.abs(nx), dr.abs(ny)
     t = dr.abs(distance)
     wide, narrow = dr.fmax(a, b), dr.fmin(a, b)
@@ -32,8 +32,8 @@ def half_plane_area(nx: mi.Float, ny: mi.Float, distance: mi.Float) -> mi.Float:
 
 
 def missed_area(nx: mi.Float, ny: mi.Float, distance: mi.Float, samples: int) -> mi.Float:
-    """Covered area that ``samples`` rays of a pixel miss, of its square about the origin where
-    n . p < ``distance``; negative where they see too much."""
+    """Return the covered area that ``samples`` rays of a pixel miss, of its square about the origin
+    where n . p < ``distance``; negative where they see too much."""
     seen = mi.Float(0)
     for dx, dy in sub_pixel_offsets(samples) - 0.5:
         seen += dr.select(nx * float(dx) + ny * float(dy) < distance, mi.Float(1 / samples), 0)
@@ -41,8 +41,8 @@ def missed_area(nx: mi.Float, ny: mi.Float, distance: mi.Float, samples: int) ->
 
 
 def add_missed(image: mi.Float, missed: mi.Float) -> mi.Float:
-    """The image (pixels * 4) with what its rays missed: no radiance below 0, no coverage outside of
-    [0, 1]."""
+    """Return the image (pixels * 4) with what its rays missed: no radiance below 0, no coverage
+    outside of [0, 1]."""
     is_coverage = (dr.arange(mi.UInt32, dr.width(image)) & 3) == 3
     return at_most(
         at_least(image + missed, 0), dr.select(is_coverage, mi.Float(1), mi.Float(dr.inf))

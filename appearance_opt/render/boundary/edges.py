@@ -4,7 +4,7 @@ Where a silhouette of the mesh moves across a pixel, the pixel changes although 
 does. Differentiating the pixel's integral over its area gives, besides the interior term that
 automatic differentiation of the shading finds, an integral along the visible silhouettes,
 
-    dI/dtheta = int (c_in - c_out) (n . dx/dtheta) dl      (Reynolds transport theorem; Li et al. 2018),
+    dI/dtheta = int (c_in - c_out) (n . dx/dtheta) dl   (Reynolds transport theorem; Li et al. 2018),
 
 with x the point of the projected edge, n its outward normal in the image, c_in and c_out the
 colours on its two sides. Edges are found from the mesh alone, sampled uniformly by projected
@@ -106,7 +106,7 @@ class EdgePoints:
         return coverage.add_missed(image, out)
 
     def keep(self, index: mi.UInt32) -> EdgePoints:
-        """The points at the given places of the list."""
+        """Take the points at the given places of the list."""
 
         def pick(v: mi.Float | mi.UInt32) -> mi.Float | mi.UInt32:
             return dr.gather(type(v), v, index)
@@ -142,7 +142,7 @@ class Edges:
         index, length = silhouette_edges(drawn, batch, run)
         if dr.width(index) == 0:
             return None
-        # in single precision the rounding of sums of 1e5 pixels is a tenth of an edge of a fine mesh
+        # in single precision sums of 1e5 pixels are rounded by a tenth of an edge of a fine mesh
         upper = dr.cumsum(mi.Float64(length))
         total = float(upper[dr.width(upper) - 1])
         count = min(max(int(total * self.density), 1), MAX_SAMPLES)
@@ -160,8 +160,8 @@ class Edges:
 
 
 def silhouette_edges(drawn: Drawn, batch: Batch, run: Run = traced) -> tuple[mi.UInt32, mi.Float]:
-    """(index, length): the silhouettes among all pairs (view * edges + edge), and their projected
-    lengths in pixels."""
+    """Return (index, length): the silhouettes among all pairs (view * edges + edge), and their
+    projected lengths in pixels."""
     visible, length = run(_candidates, drawn.shown, batch)
     index = dr.compress(visible)
     return index, dr.gather(mi.Float, length, index)

@@ -16,8 +16,8 @@ import drjit as dr
 import mitsuba as mi
 
 from appearance_opt.render.boundary.neighbours import Blend, FineGrid, Neighbours
+from appearance_opt.render.boundary.silhouette_walk import search
 from appearance_opt.render.boundary.silhouettes import edges_of
-from appearance_opt.render.boundary.walk import search
 from appearance_opt.render.camera import Camera, camera_of, direction
 from appearance_opt.render.math import clamp
 from appearance_opt.render.samples import Samples
@@ -90,8 +90,8 @@ class Intersections:
 
 
 def crossings(shown: Shown, fine: FineGrid, meeting: Neighbours) -> tuple[Crossings, Blend] | None:
-    """(where sheets that are ``meeting`` pass through each other, what moves between pixels there),
-    None without any."""
+    """Return (where sheets that are ``meeting`` pass through each other, what moves between pixels
+    there), None without any."""
     pairs, batch = meeting, fine.samples
     front, back = pairs.front, pairs.back
     camera = camera_of(batch.records, front.view)

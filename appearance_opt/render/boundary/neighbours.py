@@ -33,13 +33,13 @@ class FineGrid:
         return cls(Batch(batch.records, batch.grid.finer(per_axis)), batch, per_axis)
 
     def trace(self, scene: Scene, run: Run) -> tuple[Samples, mi.Float]:
-        """What the ray of every sample hits, and its depth."""
+        """Find what the ray of every sample hits, and its depth."""
         hits, depth = run(rays.trace_grid, scene, self.samples)
         dr.eval(hits, depth)
         return hits, depth
 
     def coarse(self, samples: Samples) -> Samples:
-        """Positions in pixels of the image, from those of the samples' grid."""
+        """Return positions in pixels of the image, from those of the samples' grid."""
         if self.per_axis == 1:
             return samples
         scale = dr.opaque(mi.Float, 1 / self.per_axis)
@@ -56,12 +56,12 @@ class Neighbours:
     horizontal: mi.Bool
 
     def keep(self, index: mi.UInt32) -> Neighbours:
-        """Those at the given positions of the list."""
+        """Take those at the given positions of the list."""
         kept = dr.gather(mi.Bool, self.horizontal, index)
         return Neighbours(self.front.keep(index), self.back.keep(index), kept)
 
     def swapped(self) -> Neighbours:
-        """Seen from the other side."""
+        """Look from the other side."""
         return Neighbours(self.back, self.front, self.horizontal)
 
     def join(self, other: Neighbours) -> Neighbours:
@@ -77,8 +77,8 @@ class Neighbours:
 
 
 def neighbours(hits: Samples, depth: mi.Float, fine: Grid) -> Neighbours | None:
-    """All neighbours among ``hits``, one in every pixel of ``fine``, that see different triangles.
-    None without."""
+    """Find all neighbours among ``hits``, one in every pixel of ``fine``, that see different
+    triangles. None without."""
     index = pixel_index(hits, fine.rows)
     triangles, depths = dr.empty(mi.UInt32, fine.pixels), dr.empty(mi.Float, fine.pixels)
     dr.scatter(triangles, hits.triangle, index, mode=dr.ReduceMode.Permute)
@@ -112,7 +112,7 @@ def neighbours(hits: Samples, depth: mi.Float, fine: Grid) -> Neighbours | None:
 
 
 def choose(condition: mi.Bool, one: Samples, other: Samples) -> Samples:
-    """``one`` where the condition holds, else ``other``, of the same views."""
+    """Take ``one`` where the condition holds, else ``other``, of the same views."""
     fields = [
         dr.select(condition, getattr(one, f), getattr(other, f)) for f in ("x", "y", "triangle")
     ]

@@ -4,7 +4,8 @@ Where neighbouring samples see different surfaces, the boundary between their ce
 and where it crosses the segment between them decides how much of the one is blended into the pixel
 of the other:
 
-    d < 1/2:  I(front) += (1/2 - d) (c_back - c_front),        d > 1/2:  I(back) += (d - 1/2) (c_front - c_back),
+    d < 1/2:  I(front) += (1/2 - d) (c_back - c_front),
+    d > 1/2:  I(back)  += (d - 1/2) (c_front - c_back),
 
 with d the distance of the crossing from the front sample, in units of the samples' distance (Laine
 et al. 2020, Modular Primitives for High-Performance Differentiable Rendering, section 3.6). Pairs
@@ -32,11 +33,11 @@ import drjit as dr
 import mitsuba as mi
 
 from appearance_opt.render.boundary.edges import EdgePoints
+from appearance_opt.render.boundary.estimator import Boundary, Estimator, Seen, changed_pixels
 from appearance_opt.render.boundary.intersections import crossings
 from appearance_opt.render.boundary.neighbours import Blend, FineGrid, Neighbours
-from appearance_opt.render.boundary.seen import Boundary, Estimator, Seen, changed_pixels
+from appearance_opt.render.boundary.silhouette_walk import search
 from appearance_opt.render.boundary.silhouettes import gather_edges
-from appearance_opt.render.boundary.walk import search
 from appearance_opt.render.camera import camera_of, project
 from appearance_opt.render.math import clamp
 from appearance_opt.render.passing import MISS

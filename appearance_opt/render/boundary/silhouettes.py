@@ -28,7 +28,7 @@ class GatheredEdges:
 
 
 def gather_edges(shown: Shown, index: mi.UInt32, active: mi.Bool | bool = True) -> GatheredEdges:
-    """The edges of the given numbers; differentiable in the vertices."""
+    """Gather the edges of the given numbers; differentiable in the vertices."""
     edges = edges_of(shown)
     corners = dr.gather(mi.ArrayXu, edges.packets, index, active, shape=(4, dr.width(index)))
     a, b = (vertex_position(shown.surface, corners[k]) for k in (0, 1))
@@ -36,14 +36,14 @@ def gather_edges(shown: Shown, index: mi.UInt32, active: mi.Bool | bool = True) 
 
 
 def edges_of(shown: Shown | Drawn) -> EdgeList:
-    """The edges of what is drawn, which must have some."""
+    """Return the edges of what is drawn, which must have some."""
     assert shown.edges is not None, "silhouettes need the edges of what is drawn"
     return shown.edges
 
 
 def is_silhouette(shown: Shown, edge: GatheredEdges, camera: Camera) -> mi.Bool:
-    """Do both faces of edges lie on one side of the plane through eye and edge? No winding is
-    needed, but for culled faces: what turns its back to the eye is not there."""
+    """Tell whether both faces of edges lie on one side of the plane through eye and edge. No
+    winding is needed, but for culled faces: what turns its back to the eye is not there."""
     m = dr.cross(edge.a - camera.eye, edge.b - edge.a)
     side, other_side = (
         dr.dot(m, vertex_position(shown.surface, edge.corners[k]) - edge.a) for k in (2, 3)
@@ -66,7 +66,7 @@ def _turned_away(bits: mi.UInt32, side: mi.Float) -> mi.Bool:
 
 
 def seen_opposite(shown: Shown, edge: GatheredEdges, camera: Camera) -> mi.UInt32:
-    """The opposite vertex of a face of each silhouette that is not culled."""
+    """Return the opposite vertex of a face of each silhouette that is not culled."""
     sides = edges_of(shown).sides
     if sides is None:
         return edge.corners[2]

@@ -35,7 +35,7 @@ class Between:
 
 
 def search(shown: Shown, hits: Samples, depth: mi.Float, fine: FineGrid, run: Run) -> Between:
-    """What lies between ``hits``, one sample in every pixel of the finer grid."""
+    """Find what lies between ``hits``, one sample in every pixel of the finer grid."""
     assert edges_of(shown).around is not None, "walks need edges of ``edge_list.walkable``"
     every = neighbours(hits, depth, fine.samples.grid)
     if every is None:
@@ -67,11 +67,11 @@ def search(shown: Shown, hits: Samples, depth: mi.Float, fine: FineGrid, run: Ru
 
 
 def walk(shown: Shown, batch: Batch, pairs: Neighbours) -> tuple[mi.UInt32, mi.UInt32]:
-    """(silhouette edge, triangle): where the lines from front to back samples leave the sheet that
-    the front sample sees. From triangle to triangle, each left by the last of its edges along the
-    line. Either a silhouette is met before the back sample, which is an edge if it is one of this
-    kind of pair's (steeper than 45 degrees for those beside each other, flatter for the others), or
-    the sheet covers the back sample, with that triangle; what is not there is MISS."""
+    """Return (silhouette edge, triangle): where the lines from front to back samples leave the
+    sheet that the front sample sees. From triangle to triangle, each left by the last of its edges
+    along the line. Either a silhouette is met before the back sample, which is an edge if it is one
+    of this kind of pair's (steeper than 45 degrees for those beside each other, flatter for the
+    others), or the sheet covers the back sample, with that triangle; what is not there is MISS."""
     around = edges_of(shown).around
     front, back, horizontal = pairs.front, pairs.back, pairs.horizontal
     count = pairs.width

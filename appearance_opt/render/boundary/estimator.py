@@ -34,17 +34,18 @@ class Boundary(Protocol):
 
     @property
     def measure(self) -> mi.Float:
-        """Length or area that each point stands for, in pixels, per unit of ``motion``."""
+        """Return the length or area that each point stands for, in pixels, per unit of
+        ``motion``."""
         ...
 
     def motion(self, shown: Shown, batch: Batch) -> mi.Float:
-        """Where each point lies across the boundary, outward; differentiable in the vertices. Only
-        its derivative means anything."""
+        """Return where each point lies across the boundary, outward; differentiable in the
+        vertices. Only its derivative means anything."""
         ...
 
     def corrected(self, image: mi.Float, rays: int, grid: Grid) -> mi.Float:
-        """The image (pixels * 4) with what ``rays`` rays in each crossed pixel miss of the covered
-        area, as far as these points know it."""
+        """Return the image (pixels * 4) with what ``rays`` rays in each crossed pixel miss of the
+        covered area, as far as these points know it."""
         ...
 
 
@@ -79,8 +80,8 @@ class Estimator:
         """Raise ValueError if it cannot do with such a sampling."""
 
     def see(self, drawn: Drawn, batch: Batch, sampling: Sampling, seed: int, run: Run) -> Seen:
-        """What is seen, without gradients. ``seed``: of everything random; ``run``: how stages are
-        called (see ``freezing``)."""
+        """Find what is seen, without gradients. ``seed``: of everything random; ``run``: how stages
+        are called (see ``freezing``)."""
         raise NotImplementedError
 
 
@@ -93,13 +94,13 @@ class Finder(Protocol):
     def find(
         self, drawn: Drawn, batch: Batch, sampling: Sampling, seed: int, run: Run
     ) -> Boundary | None:
-        """The boundaries, without their contrast; None without any. Arguments as for
+        """Find the boundaries, without their contrast; None without any. Arguments as for
         ``Estimator.see``."""
         ...
 
 
 def changed_pixels(pixels: list[mi.UInt32], count: int) -> mi.Bool:
-    """(count,) which pixels of a batch are among lists of indices."""
+    """Mark (count,) which pixels of a batch are among lists of indices."""
     out = dr.zeros(mi.Bool, count)
     for some in pixels:
         dr.scatter(out, mi.Bool(True), some)
