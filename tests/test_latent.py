@@ -30,6 +30,7 @@ from appearance_opt.optimize.step import Gradients, StepInputs
 from appearance_opt.optimize.validation import Validation
 from appearance_opt.reference.mesh import MeshReference
 from appearance_opt.reference.pool import ReferencePool, Targets
+from appearance_opt.render.boundary.camera_rays import CameraRays
 from appearance_opt.render.images import render_image
 from appearance_opt.render.pixels import Batch, Grid
 from appearance_opt.render.quality import Quality
@@ -79,7 +80,7 @@ def test_a_part_of_its_own_is_fitted_in_every_frame() -> None:
     assert set(latent.parameters) == {"slide"}
     reference = mi.Float(np.tile(np.array([0.1, 0.1, 0.1, 1], np.float32), grid.pixels))
     inputs = StepInputs(views, Targets(reference), np.zeros((2, 3), np.float32), 0.0, 0.0, 3)
-    gradients = Gradients(latent, grid, Quality(0.0, 1, 4), LOSSES["l2"])
+    gradients = Gradients(latent, grid, Quality(4, visibility=CameraRays(())), LOSSES["l2"])
     start, step = np.array(latent.values()["slide"]), 2e-3
     for pose in latent.poses:
         latent.select(pose)
