@@ -117,6 +117,20 @@ def group_by_node(asset: Asset) -> dict[int | None, list[int]]:
     return groups
 
 
+def owners(asset: Asset) -> NDArray[np.int32] | None:
+    """(F,) number of the node of each face of all meshes, one after the other, -1 for none; None
+    for an asset without nodes."""
+    if not asset.nodes:
+        return None
+    own = [-1 if m.node is None else m.node for m in asset.meshes]
+    return np.repeat(np.array(own, np.int32), [len(m.faces) for m in asset.meshes])
+
+
+def merge_nodes(asset: Asset) -> Asset:
+    """An asset whose meshes belong to no node."""
+    return replace(asset, nodes=(), meshes=tuple(replace(m, node=None) for m in asset.meshes))
+
+
 def without_idle_nodes(asset: Asset, kept: Iterable[int] = ()) -> Asset:
     """An asset without the nodes that lead neither to a mesh nor to one of those ``kept``."""
     used = {m.node for m in asset.meshes if m.node is not None} | set(kept)

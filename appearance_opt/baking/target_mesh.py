@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from appearance_opt.asset.hierarchy import owners
 from appearance_opt.asset.normals import vertex_normals, weld
 from appearance_opt.asset.sides import single_sided
 from appearance_opt.asset.tangents import split_and_tangents
@@ -57,7 +58,7 @@ def prepare(asset: Asset) -> Low:
     latent = LatentMesh(
         positions, faces, np.arange(len(positions), dtype=np.int32), faces, uvs, normals, tangents
     )
-    latent = replace(latent, single=single_sided(asset.meshes))
+    latent = replace(latent, single=single_sided(asset.meshes), owner=owners(asset))
     return Low(replace(asset, meshes=tuple(meshes)), latent)
 
 
@@ -87,6 +88,7 @@ def movable(mesh: LatentMesh) -> LatentMesh:
         frame_faces=mesh.frame_faces,
         uvs=mesh.uvs,
         single=mesh.single,
+        owner=mesh.owner,
     )
 
 

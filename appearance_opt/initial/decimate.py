@@ -76,6 +76,7 @@ def decimate_with_source(
     triangles: int,
     importance: NDArray | None = None,
     single_sided: NDArray | None = None,
+    owner: NDArray | None = None,
     told: Callable[[int], None] = lambda _: None,
 ) -> tuple[NDArray[np.float64], NDArray[np.int32], NDArray[np.int64]]:
     """At most ``triangles`` triangles that look like the given ones.
@@ -83,6 +84,8 @@ def decimate_with_source(
     ``positions`` (V, 3), ``faces`` (F, 3): any triangle soup; vertices at one place are welded, so
     that attribute seams are no borders. ``importance`` (F,): non-negative weight of each face, 1 by
     default. ``single_sided`` (F,): faces that are seen from their front only; none are by default.
+    ``owner`` (F,): number of the part to which each belongs, one for all by default: where parts
+    touch their vertices move together, so that no gap opens, and no edge between them is flipped.
     Faces that lie on others and add nothing to any image go first (see ``stacks``). Parts that
     would cost more than they show are dropped as a whole. ``told``: called before rounds with the
     number of triangles that are left.
@@ -119,7 +122,8 @@ def decimate_with_source(
             pass
     if len(state.faces) > triangles:
         state.keep(np.zeros(len(state.faces), bool))
-    state.faces, _ = flip_edges(state.positions, state.faces, single[state.source], state.quadrics)
+    kind = single.astype(np.int64) if owner is None else 2 * owner.astype(np.int64) + single
+    state.faces, _ = flip_edges(state.positions, state.faces, kind[state.source], state.quadrics)
     used, compact = np.unique(state.faces, return_inverse=True)
     return (
         state.positions[used] * scale + centre,

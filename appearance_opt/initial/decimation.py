@@ -3,6 +3,7 @@ where there are very many."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -47,7 +48,7 @@ def is_coarse(faces: int, vertices: int, clusters: int, budget: float | None) ->
 
 
 class Decimation:
-    """``positions``, ``faces``, ``single``: what is decimated, the reference's own triangles or,
+    """``positions``, ``faces``, ``single``, ``owner``: what is decimated, the reference's own triangles or,
     if that is ``coarse``, clusters of them; ``weight``: importance of these faces by how much is
     seen of them; ``visible``: those that are decimated at all."""
 
@@ -67,6 +68,7 @@ class Decimation:
         called with what begins."""
         self._tell, self._triangles = tell, triangles
         self.positions, self.faces, self.single = heavy.positions, heavy.faces, heavy.single
+        self.owner = heavy.owner
         scene = heavy.scene
         clusters = max(CLUSTERS * triangles, LEAST_CLUSTERS)
         self.coarse = is_coarse(len(heavy.faces), len(heavy.positions), clusters, budget)
@@ -74,6 +76,7 @@ class Decimation:
             tell("clustering vertices")
             self.positions, self.faces, source = cluster(heavy.positions, heavy.faces, clusters)
             self.single = heavy.single[source]
+            self.owner = None if heavy.owner is None else heavy.owner[source]
             hidden_backs = culled(self.positions, self.faces, self.single)
             scene = upload.scene_of(self.positions, self.faces, hidden_backs)
         count = len(self.faces)
@@ -88,15 +91,18 @@ class Decimation:
         """The mesh decimated with these importances of its faces (F,), its charts not yet packed.
         Raises InputError if nothing is left of it."""
         single = self.single[self.visible]
+        owner = None if self.owner is None else self.owner[self.visible]
         positions, faces, source = decimate_with_source(
             self.positions,
             self.faces[self.visible],
             self._triangles,
             weight[self.visible],
             single,
+            owner,
             told=lambda left: self._tell(f"decimating: {left:,} triangles left"),
         )
         if not len(faces):
             raise InputError("nothing is left of this mesh at that budget; ask for more triangles")
         self._tell(f"unwrapping {len(faces):,} triangles")
-        return make_charts(positions, faces, single[source])
+        charts = make_charts(positions, faces, single[source])
+        return charts if owner is None else replace(charts, owner=owner[source])

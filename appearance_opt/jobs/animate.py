@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from appearance_opt import backend
+from appearance_opt.asset.origin import ZERO
 from appearance_opt.asset.posing import pose_asset
 from appearance_opt.config import AnimateOptions, resolve_options, with_values
 from appearance_opt.errors import InputError
@@ -242,11 +243,12 @@ def _exported(
     maps = clean_maps(model, start.known)
     still = replace(start.mesh, positions=model.host_positions())
     bind = latent_of(still, maps, frozenset({"normal", "material"}))
-    exporter = Exporter(subject.placement, (0.0, 0.0, 0.0), name, _skin_of(model))
+    like = replace(asset, origin=ZERO, nodes=())  # the rig has a hierarchy of its own
+    exporter = Exporter(subject.placement, like, name, _skin_of(model))
     exported = export(
         bind, replace(start, maps=maps, known=np.ones_like(start.known)), subject, options, exporter
     )
-    begin = Exporter(subject.placement, (0.0, 0.0, 0.0), name, given)
+    begin = Exporter(subject.placement, like, name, given)
     before = begin.base(latent_of(start.mesh, start.maps), start.maps)
     with_rig = partial(replace, rig=animation.rig, contents=asset.contents)
     exported = replace(exported, asset=with_rig(exported.asset), start=with_rig(before))

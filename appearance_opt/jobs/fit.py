@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from appearance_opt import backend
-from appearance_opt.asset.origin import ZERO
 from appearance_opt.asset.types import Asset
 from appearance_opt.baking import check
 from appearance_opt.baking.target_mesh import movable, prepare, unwrap_asset
@@ -113,19 +112,19 @@ def _fit(
     """A start and its fit. What is known of the surface of the reference is the start's."""
     mesh: LatentMesh | None = None
     notes: tuple[str, ...] = ()
-    name, origin, placement = "fitted", ZERO, subject.placement
+    like, placement = Asset((), "fitted"), subject.placement
     if parts is not None:
-        name, origin, notes = parts.fitted.name, parts.fitted.origin, parts.fitted.notes
+        like, notes = parts.fitted, parts.fitted.notes
         mesh = movable(prepare(parts.fitted).mesh)
-        local = placement.relative_to(origin).to_local(mesh.positions)
+        local = placement.relative_to(like.origin).to_local(mesh.positions)
         mesh = replace(mesh, positions=local.astype("float32"))
         survey = MeshSurvey(MeshReference(placement.local(parts.fitted)))
         subject = replace(subject, survey=survey)
     start, left = choose_start(subject, mesh, options, run)
     run.lap("start")
     model, fitted, error = fit_start(subject, start, left, run)
-    exported = export(model, start, subject, left, Exporter(placement, origin, name))
+    exported = export(model, start, subject, left, Exporter(placement, like, like.name))
     run.lap("export")
     parts = Parts(exported.asset) if parts is None else parts
-    result = SimplifyResult.of(exported, parts, fitted, (name, 0), [*notes, *start.notes])
+    result = SimplifyResult.of(exported, parts, fitted, (like.name, 0), [*notes, *start.notes])
     return replace(result, error=error)

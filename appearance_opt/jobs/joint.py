@@ -68,7 +68,7 @@ def _fit(pair: Pair, options: JointOptions, run: Run) -> SimplifyResult:
     fitted = tuple(dict.fromkeys(("shape", *options.fit.parts)))
     model, fit, error = fit_start(subject, start, with_values(options, fit=fitted), run)
     light = pair.low_parts.fitted
-    exporter = Exporter(subject.placement, light.origin, light.name)
+    exporter = Exporter(subject.placement, light, light.name)
     exported = export(model, start, subject, options, exporter)
     run.lap("export")
     source = (pair.high.name, len(survey.triangles.faces))

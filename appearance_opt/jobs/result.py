@@ -81,10 +81,10 @@ class Result:
 class SimplifyResult(Result):
     """What a job did that fits a mesh (``simplify``, ``joint``, ``fit``).
 
-    The first mesh of ``asset`` was fitted (the first two where some faces are seen from one side
-    and others from both); the others passed through: they have ``kept_triangles``, which
-    ``triangles`` and ``source_triangles`` do not count. ``tessellated``: with a displacement map,
-    the mesh as drawn at each level (and ``start`` at the finest one).
+    The first meshes of ``asset`` were fitted: one for each node of the source, two where some of
+    its faces are seen from one side and others from both. The others passed through: they have
+    ``kept_triangles``, which ``triangles`` and ``source_triangles`` do not count. ``tessellated``:
+    with a displacement map, the mesh as drawn at each level (and ``start`` at the finest one).
     """
 
     fit: FitResult = field(kw_only=True)

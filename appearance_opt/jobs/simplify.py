@@ -78,7 +78,8 @@ def simplify(
         outputs.check_inputs(asset, first)
         expected = round((options.start.ratio or 1.0) * asset.triangle_count)
         outputs.check_room(options.start.triangles or expected, options)
-        parts = split(asset, name_of(source), "simplify")
+        parts = split(asset, name_of(source), "simplify", named=options.parts.keep)
+        parts = parts.merged() if options.parts.parts == "merge" else parts
         run.lap("load")
         backend.select(options.device)
         if outputs.checkpoint is not None:
@@ -113,11 +114,12 @@ def _fit(
     run.lap("start")
     model, fit, error = fit_start(subject, start, left, run)
     name = f"{asset.name}_{len(start.mesh.faces)}"
-    exporter = Exporter(subject.placement, asset.origin, name)
+    exporter = Exporter(subject.placement, asset, name)
     exported = export(model, start, subject, left, exporter)
     run.lap("export")
     source = (asset.name, asset.triangle_count)
-    result = SimplifyResult.of(exported, parts, fit, source, [*notes, *start.notes])
+    notes += [*start.notes, *parts.describe_nodes(exported.asset)]
+    result = SimplifyResult.of(exported, parts, fit, source, notes)
     return replace(result, error=error)
 
 

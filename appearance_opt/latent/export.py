@@ -29,11 +29,11 @@ def to_asset(
     name: str,
     skin: Skin | None = None,
 ) -> Asset:
-    """One mesh, one material; two, with the same textures, where some faces are seen from both
-    sides and others from their front only. ``positions`` (V, 3); ``maps``: natural values by
-    channel name, images or numbers. Normals are angle weighted and tangents MikkTSpace's: what the
-    renderer of the fit uses, so that the maps mean the same in another one. ``skin``: of the welded
-    vertices."""
+    """One mesh for each node that faces belong to, and one material; two, with the same textures,
+    where some faces are seen from both sides and others from their front only. ``positions`` (V,
+    3); ``maps``: natural values by channel name, images or numbers. Normals are angle weighted and
+    tangents MikkTSpace's: what the renderer of the fit uses, so that the maps mean the same in
+    another one. ``skin``: of the welded vertices."""
     p, tangents = positions[mesh.frame_vertex], None
     normals = summed_normals(positions, mesh.faces, welded=True)[mesh.frame_vertex]
     index, faces, n = split_where_cancelled(p, mesh.frame_faces, normals)
@@ -51,15 +51,32 @@ def to_asset(
         name=name,
         skin=None if skin is None else skin.take(vertex),
     )
-    return Asset(_by_side(whole, mesh.single), name)
+    parts = _by_owner(whole, mesh.owner)
+    if mesh.single is None or not mesh.single.any():
+        return Asset(tuple(part for part, _ in parts), name)
+    one_way = replace(whole.material, double_sided=False)
+    return Asset(
+        tuple(p for part, of in parts for p in _by_side(part, mesh.single[of], one_way)), name
+    )
 
 
-def _by_side(mesh: Mesh, single: NDArray[np.bool_] | None) -> tuple[Mesh, ...]:
+def _by_owner(mesh: Mesh, owner: NDArray[np.int32] | None) -> list[tuple[Mesh, NDArray]]:
+    """(the mesh of each node that owns faces, numbers of its faces in the whole)."""
+    if owner is None:
+        return [(mesh, np.arange(len(mesh.faces)))]
+    out = []
+    for node in np.unique(owner).tolist():
+        own = np.flatnonzero(owner == node)
+        part = mesh if len(own) == len(owner) else _part(mesh, own)
+        out.append((replace(part, node=None if node < 0 else node), own))
+    return out
+
+
+def _by_side(mesh: Mesh, single: NDArray[np.bool_], one_way: Material) -> tuple[Mesh, ...]:
     """A mesh whose material is double-sided, or what is so of it, and those of its faces
-    (``single`` (F,)) that are seen from their front only."""
-    if single is None or not single.any():
+    (``single`` (F,)) that are seen from their front only, of the material ``one_way``."""
+    if not single.any():
         return (mesh,)
-    one_way = replace(mesh.material, double_sided=False)
     if single.all():
         return (replace(mesh, material=one_way),)
     return _part(mesh, ~single), replace(
@@ -67,8 +84,8 @@ def _by_side(mesh: Mesh, single: NDArray[np.bool_] | None) -> tuple[Mesh, ...]:
     )
 
 
-def _part(mesh: Mesh, faces: NDArray[np.bool_]) -> Mesh:
-    """Some faces of a mesh, with the vertices that they use."""
+def _part(mesh: Mesh, faces: NDArray) -> Mesh:
+    """Some faces of a mesh (a mask, or numbers), with the vertices that they use."""
     used, corners = np.unique(mesh.faces[faces], return_inverse=True)
     return mesh.take(used, corners.reshape(-1, 3))
 

@@ -40,6 +40,8 @@ class LatentMesh:
     fitted.
 
     ``single`` (F,): faces that are seen from their front only; None: all are seen from both sides.
+    ``owner`` (F,): number of the node of the asset to which each face belongs, -1 for none; None
+    where there are no nodes.
     """
 
     positions: NDArray[np.float32]
@@ -50,6 +52,7 @@ class LatentMesh:
     normals: NDArray[np.float32] | None = None
     tangents: NDArray[np.float32] | None = None
     single: NDArray[np.bool_] | None = None
+    owner: NDArray[np.int32] | None = None
 
 
 class LatentTopology:

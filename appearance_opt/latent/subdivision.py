@@ -59,7 +59,16 @@ def tessellate(mesh: LatentMesh, level: int) -> Tessellation:
     parents, weights = _rows(combination)
     positions = np.einsum("nk,nkc->nc", weights, mesh.positions[parents])
     single = None if mesh.single is None else np.repeat(mesh.single, 4**level)
-    fine = LatentMesh(positions.astype(np.float32), faces, frame_vertex, frames, uvs, single=single)
+    owner = None if mesh.owner is None else np.repeat(mesh.owner, 4**level)
+    fine = LatentMesh(
+        positions.astype(np.float32),
+        faces,
+        frame_vertex,
+        frames,
+        uvs,
+        single=single,
+        owner=owner,
+    )
     return Tessellation(level, fine, parents, weights)
 
 

@@ -12,6 +12,7 @@ from appearance_opt.options.files import OutputOptions
 from appearance_opt.options.fitting import FittingOptions
 from appearance_opt.options.maps import DisplacementOptions, TextureOptions
 from appearance_opt.options.option import Record, option, part, require
+from appearance_opt.options.parts import PartOptions
 from appearance_opt.options.reading import AssetOptions
 from appearance_opt.options.start import StartOptions
 from appearance_opt.options.views import ViewOptions
@@ -56,6 +57,7 @@ class SimplifyOptions(CommonOptions):
     """How to simplify."""
 
     start: StartOptions = part(StartOptions)
+    parts: PartOptions = part(PartOptions)
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ import numpy as np
 
 from appearance_opt.asset.alpha import seen_through
 from appearance_opt.asset.batch import Batch, fill_normals, replace_chosen
+from appearance_opt.asset.hierarchy import owners
 from appearance_opt.asset.sides import culled, single_sided
 from appearance_opt.asset.tangents import any_tangent, split_and_tangents
 from appearance_opt.reference.textures import coverage_maps, emission_maps, material_maps
@@ -41,6 +42,7 @@ class MeshReference:
     """Renders an asset. ``survey.MeshSurvey`` answers what its surface looks like.
 
     ``merged``: the host arrays; ``single`` (F,): faces that are seen from their front only;
+    ``owner`` (F,): number of the node to which each face belongs, None for an asset without nodes;
     ``drawn``: the same on the device; ``emission``: what the materials emit, which is not rendered;
     None if they do not; ``coverage``: what light the materials keep back; None if all of it.
     """
@@ -54,7 +56,7 @@ class MeshReference:
         self._material_of = [number[id(m.material)] for m in asset.meshes]
         self.merged = merge(asset, self._material_of, maps.has_normal_map)
         m = self.merged
-        self.single = single_sided(asset.meshes)
+        self.single, self.owner = single_sided(asset.meshes), owners(asset)
         passing = None
         if self.coverage is not None:
             passing = np.repeat(

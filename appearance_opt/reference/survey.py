@@ -72,12 +72,13 @@ class Appearance:
 class Triangles:
     """The surface as triangles, from which starts are decimated. ``positions`` (V, 3); ``faces``
     (F, 3); ``single`` (F,): faces that are seen from their front only; ``scene``: the same for
-    rays."""
+    rays; ``owner`` (F,): number of the part to which each belongs, None for one part."""
 
     positions: NDArray[np.float32]
     faces: NDArray[np.int32]
     single: NDArray[np.bool_]
     scene: Scene
+    owner: NDArray[np.int32] | None = None
 
 
 class Survey(Protocol):
@@ -184,7 +185,7 @@ class MeshSurvey:
     def triangles(self) -> Triangles:
         """See ``Survey``."""
         r = self._reference
-        return Triangles(r.merged.positions, r.merged.faces, r.single, r.scene)
+        return Triangles(r.merged.positions, r.merged.faces, r.single, r.scene, r.owner)
 
     def spread(self, count: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """See ``Survey``."""

@@ -7,7 +7,13 @@ from typing import TYPE_CHECKING, TypeVar
 from appearance_opt.config import SimplifyOptions, with_values
 from appearance_opt.stages.decimated import decimate_start
 from appearance_opt.stages.growth import SHARE, Effort, grow_start, mend_start, sphere_start
-from appearance_opt.stages.start import budget, inherit_sides, require_survey, transfer_appearance
+from appearance_opt.stages.start import (
+    budget,
+    inherit_owners,
+    inherit_sides,
+    require_survey,
+    transfer_appearance,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -44,7 +50,10 @@ def choose_start(
     else:
         count, left = budget(o, available), run.seconds_left()
         start = _make(lambda: decimate_start(subject, options, count, left, run.begin), run)
-    return (start if survey is None else inherit_sides(start, survey.triangles.single)), o
+    if survey is None:
+        return start, o
+    start = inherit_sides(start, survey.triangles.single)
+    return inherit_owners(start, survey.triangles), o
 
 
 def _make(make: Callable[[], Start], run: Run) -> Start:

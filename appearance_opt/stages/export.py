@@ -19,7 +19,6 @@ from appearance_opt.stages.plain import flatten_maps
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from appearance_opt.asset.origin import Origin
     from appearance_opt.asset.rig import Skin
     from appearance_opt.asset.types import Asset
     from appearance_opt.config import CommonOptions
@@ -56,13 +55,14 @@ def export(
 
 
 class Exporter:
-    """Assets of a displaced model, in the place and scale of the input, relative to its ``origin``.
-    ``placement``: of the model in the world; ``skin``: of its vertices, if it has one."""
+    """Assets of a displaced model, in the place and scale of the input ``like`` which they are,
+    with its nodes and its credits. ``placement``: of the model in the world; ``skin``: of its
+    vertices, if it has one."""
 
     def __init__(
-        self, placement: Placement, origin: Origin, name: str, skin: Skin | None = None
+        self, placement: Placement, like: Asset, name: str, skin: Skin | None = None
     ) -> None:
-        self.placement, self.origin, self.name = placement.relative_to(origin), origin, name
+        self.placement, self.like, self.name = placement.relative_to(like.origin), like, name
         self.skin = skin
 
     def base(self, model: Latent, maps: dict) -> Asset:
@@ -88,8 +88,19 @@ class Exporter:
         return out
 
     def _asset(self, mesh: LatentMesh, positions: NDArray, maps: dict, name: str) -> Asset:
-        world = self.placement.to_world(positions)
-        return replace(to_asset(mesh, world, maps, name, self.skin), origin=self.origin)
+        like, world = self.like, self.placement.to_world(positions)
+        asset = to_asset(mesh, world, maps, name, self.skin)
+        meshes = (
+            m if m.node is None else replace(m, name=like.nodes[m.node].name + m.name[len(name) :])
+            for m in asset.meshes
+        )
+        return replace(
+            asset,
+            meshes=tuple(meshes),
+            origin=like.origin,
+            nodes=like.nodes,
+            credits=like.credits,
+        )
 
 
 def write_companion(asset: Asset, out: Path) -> None:

@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from appearance_opt.asset.normals import weld
+from appearance_opt.asset.normals import unit, weld
 from appearance_opt.asset.sides import single_sided
 from appearance_opt.errors import InputError
 from appearance_opt.initial.atlas import unwrap
+from appearance_opt.initial.influences import closest_points
 from appearance_opt.initial.transfer import transfer
 from appearance_opt.latent.mesh import LatentMesh
 from appearance_opt.render.material import COLORS, UNLIT
@@ -32,7 +33,7 @@ if TYPE_CHECKING:
     from appearance_opt.asset.types import Asset
     from appearance_opt.config import SimplifyOptions
     from appearance_opt.reference.subject import Subject
-    from appearance_opt.reference.survey import Survey
+    from appearance_opt.reference.survey import Survey, Triangles
 
 log = logging.getLogger(__name__)
 
@@ -142,6 +143,22 @@ def inherit_sides(start: Start, single: NDArray[np.bool_]) -> Start:
     mesh, finest = meshes
     assert mesh is not None
     return replace(start, mesh=mesh, finest=finest)
+
+
+def inherit_owners(start: Start, heavy: Triangles) -> Start:
+    """A start whose triangles stem from none of the reference's: each belongs to the part of the
+    closest one that faces the same way."""
+    if start.mesh.owner is not None or heavy.owner is None:
+        return start
+    mesh, finest = start.mesh, start.finest
+    corners = mesh.positions[mesh.faces].astype(np.float64)
+    facing = unit(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
+    closest, _ = closest_points(corners.mean(axis=1), facing, heavy.positions, heavy.faces)
+    owner = heavy.owner[closest]
+    if finest is not None:  # the children of a triangle lie one after the other
+        children = len(finest.faces) // len(mesh.faces)
+        finest = replace(finest, owner=np.repeat(owner, children))
+    return replace(start, mesh=replace(mesh, owner=owner), finest=finest)
 
 
 def atlas_of(
