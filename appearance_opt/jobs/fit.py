@@ -97,7 +97,9 @@ def _asked(
 def _read(start: Asset | Path | str, options: SimplifyOptions) -> Parts:
     """What of a start is fitted, on an atlas of its own, and what of it is left alone."""
     asset = load_layout(start, options, options.asset.missing_textures)
-    parts = split(asset, name_of(start), "start from", by_light=False)
+    kept = options.parts.keep
+    parts = split(asset, name_of(start), "start from", by_light=False, named=kept)
+    parts = parts.merged() if options.parts.parts == "merge" else parts
     try:
         check.check_uvs(parts.fitted, name_of(start))
         check.check_overlap(prepare(parts.fitted).mesh, name_of(start))
