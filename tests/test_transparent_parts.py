@@ -84,7 +84,7 @@ def test_simplified_beside_what_stays(tmp_path: Path, snow_globe: Asset) -> None
     for asset in (result.asset, written):
         check_kept(asset, source)
     # what nobody would see behind an opaque shell is there, at its place and in its colour
-    fitted = written.meshes[0]
+    (fitted,) = (m for m in written.meshes if m.name == "ball")
     assert len(written.meshes) == 3
     assert len(fitted.faces) == result.triangles
     np.testing.assert_allclose(np.abs(fitted.positions).max(axis=0), 0.5, atol=0.05)

@@ -25,13 +25,13 @@ class PartOptions(Record):
 
     parts: str = option(
         "keep",
-        "Are parts written under their nodes, with names and pivots, or as one mesh?",
+        "Parts are written as the nodes that they were, with names and pivots, or as one mesh.",
         panel="Output",
         choices=PARTS,
     )
     keep: tuple[str, ...] = option(
         (),
-        "Node or material that passes into the result as it is (repeatable; * and ? stand for any).",
+        "Node or material that passes into the result as it is (repeatable, with * and ?).",
         panel="Input",
         metavar="NAME",
         repeated=True,
