@@ -172,11 +172,10 @@ def test_verdicts_say_what_was_measured() -> None:
     assert say(sizes(0.2, 0.06, 0.04)).startswith("Differences are hardly visible at 96 pixels; at")
     assert say(sizes(0.04, 0.02)).startswith("Differences are hardly visible at 384 pixels: an eye")
     assert say(sizes(0.2, 0.0, 0.3)) == (  # what is seen when it is smaller is not invisible
-        "At 384 pixels, an eye that flips between the two notices 20 % of the pixels, at 96 30 % of "
-        "them."
+        "An eye that flips between the two notices 20 % of the pixels at 384 pixels, and 30 % at 96."
     )
     assert say(sizes(0.2)) == (
-        "At 384 pixels, an eye that flips between the two notices 20 % of the pixels."
+        "An eye that flips between the two notices 20 % of the pixels at 384 pixels."
     )
     assert [percent(x) for x in (0, 0.00004, 0.0123, 0.0996, 1)] == [
         "0 %",

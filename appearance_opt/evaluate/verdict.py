@@ -51,23 +51,21 @@ def describe_visibility(sizes: list[AtSize]) -> str:
     'Differences are invisible at 48 pixels; at 96, an eye that flips between the two notices 20 % of the pixels.'
     """
     largest, smallest = sizes[0], sizes[-1]
-    noticed = f"an eye that flips between the two notices {percent(largest.noticed)} of the pixels"
+    eye, share = "an eye that flips between the two notices", percent(largest.noticed)
     unseen = _largest(sizes, INVISIBLE)
     if unseen is largest:
         return f"Differences are invisible at {largest.pixels} pixels, the largest size measured."
     for found, how in ((unseen, "invisible"), (_largest(sizes, HARDLY), "hardly visible")):
+        if found is None:
+            continue
+        said = f"Differences are {how} at {found.pixels} pixels"
         if found is largest:
-            return f"Differences are {how} at {largest.pixels} pixels: {noticed}."
-        if found is not None:
-            return (
-                f"Differences are {how} at {found.pixels} pixels; at {largest.pixels}, {noticed}."
-            )
+            return f"{said}: {eye} {share} of the pixels."
+        return f"{said}; at {largest.pixels}, {eye} {share} of the pixels."
+    said = f"{eye[0].upper()}{eye[1:]} {share} of the pixels at {largest.pixels} pixels"
     if smallest is largest:
-        return f"At {largest.pixels} pixels, {noticed}."
-    return (
-        f"At {largest.pixels} pixels, {noticed}, at {smallest.pixels} "
-        f"{percent(smallest.noticed)} of them."
-    )
+        return f"{said}."
+    return f"{said}, and {percent(smallest.noticed)} at {smallest.pixels}."
 
 
 def _largest(sizes: list[AtSize], share: float) -> AtSize | None:
