@@ -42,7 +42,7 @@
     for (const element of document.querySelectorAll('script.scene'))
       scenes[element.dataset.name] = await build(THREE, JSON.parse(element.textContent));
     const camera = new THREE.PerspectiveCamera(28, 1, 0.05, 50);
-    const lamp = new THREE.DirectionalLight(0xffffff, Math.PI * 0.85);
+    const lamp = new THREE.DirectionalLight(0xffffff, 0.85); // three.js of this age multiplies by pi
     let azimuth = sky.azimuth, elevation = sky.elevation, distance = 4.2;
     const target = new THREE.Vector3();
     const value = (name) => root.querySelector(`input[name=${name}]:checked`).value;
