@@ -23,6 +23,7 @@ from appearance_opt.stages.choice import choose_start
 from appearance_opt.stages.export import Exporter, export
 from appearance_opt.stages.fitting import fit_start
 from appearance_opt.stages.parts import Parts, split
+from appearance_opt.stages.start import localize
 
 if TYPE_CHECKING:
     from appearance_opt.latent.mesh import LatentMesh
@@ -117,9 +118,7 @@ def _fit(
     like, placement = Asset((), "fitted"), subject.placement
     if parts is not None:
         like, notes = parts.fitted, parts.fitted.notes
-        mesh = movable(prepare(parts.fitted).mesh)
-        local = placement.relative_to(like.origin).to_local(mesh.positions)
-        mesh = replace(mesh, positions=local.astype("float32"))
+        mesh = localize(movable(prepare(like).mesh), placement, like.origin)
         survey = MeshSurvey(MeshReference(placement.local(parts.fitted)))
         subject = replace(subject, survey=survey)
     start, left = choose_start(subject, mesh, options, run)
@@ -128,5 +127,5 @@ def _fit(
     exported = export(model, start, subject, left, Exporter(placement, like, like.name))
     run.lap("export")
     parts = Parts(exported.asset) if parts is None else parts
-    result = SimplifyResult.of(exported, parts, fitted, (like.name, 0), [*notes, *start.notes])
-    return replace(result, error=error)
+    told = [*notes, *start.notes]
+    return SimplifyResult.of(exported, parts, fitted, (like.name, 0), told, error)

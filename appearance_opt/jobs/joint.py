@@ -3,7 +3,6 @@ together."""
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -72,5 +71,4 @@ def _fit(pair: Pair, options: JointOptions, run: Run) -> SimplifyResult:
     exported = export(model, start, subject, options, exporter)
     run.lap("export")
     source = (pair.high.name, len(survey.triangles.faces))
-    result = SimplifyResult.of(exported, pair.low_parts, fit, source, pair.notes)
-    return replace(result, error=error)
+    return SimplifyResult.of(exported, pair.low_parts, fit, source, pair.notes, error)

@@ -101,6 +101,7 @@ class SimplifyResult(Result):
         fit: FitResult,
         source: tuple[str, int],
         notes: Iterable[str],
+        error: DivergedError | None = None,
     ) -> SimplifyResult:
         """What was fitted, with the ``parts`` that were left alone after it. ``source``: name of
         what it was fitted to, and number of its triangles (0: it has none)."""
@@ -115,6 +116,7 @@ class SimplifyResult(Result):
             title=f"{name}: {f'{before:,} to ' if before else ''}{after:,} triangles",
             facts={"triangles": f"{after} of {before}" if before else after},
             notes=[*notes, *fit.notes()],
+            error=error,
             fit=fit,
             triangles=after,
             source_triangles=before,

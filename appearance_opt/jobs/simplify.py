@@ -119,8 +119,7 @@ def _fit(
     run.lap("export")
     source = (asset.name, asset.triangle_count)
     notes += [*start.notes, *parts.describe_nodes(exported.asset)]
-    result = SimplifyResult.of(exported, parts, fit, source, notes)
-    return replace(result, error=error)
+    return SimplifyResult.of(exported, parts, fit, source, notes, error)
 
 
 def fingerprint(options: SimplifyOptions, asset: Asset, first: Asset | None) -> str:

@@ -15,7 +15,7 @@ from appearance_opt.baking.target_mesh import prepare, unwrap_asset
 from appearance_opt.errors import InputError
 from appearance_opt.placement import Placement
 from appearance_opt.reference.subject import Subject
-from appearance_opt.stages.start import require_survey
+from appearance_opt.stages.start import localize, require_survey
 from appearance_opt.views import views_around
 
 if TYPE_CHECKING:
@@ -72,8 +72,7 @@ class Pair:
         run.lap("check")
         placement = Placement.around(np.concatenate([heavy.points(), light.points()]))
         subject = Subject.of_asset(heavy, options.views.seed, options.views.light, placement)
-        local = placement.relative_to(light.origin).to_local(prepared.mesh.positions)
-        mesh = replace(prepared.mesh, positions=local.astype(np.float32))
+        mesh = localize(prepared.mesh, placement, light.origin)
         run.lap("reference")
         cage = None if o.cage is None else o.cage / placement.scale
         return cls(subject, whole, prepared, mesh, low, cage, notes)

@@ -30,8 +30,10 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from appearance_opt.asset.origin import Origin
     from appearance_opt.asset.types import Asset
     from appearance_opt.config import SimplifyOptions
+    from appearance_opt.placement import Placement
     from appearance_opt.reference.subject import Subject
     from appearance_opt.reference.survey import Survey, Triangles
 
@@ -90,6 +92,12 @@ def require_survey(subject: Subject) -> Survey:
             "images are all that is known of this reference: start from a mesh or a sphere"
         )
     return subject.survey
+
+
+def localize(mesh: LatentMesh, placement: Placement, origin: Origin) -> LatentMesh:
+    """A mesh of the world, relative to ``origin``, in local coordinates."""
+    local = placement.relative_to(origin).to_local(mesh.positions)
+    return replace(mesh, positions=local.astype(np.float32))
 
 
 def select_told(unlit: bool, maps: Mapping[str, NDArray | float]) -> dict[str, NDArray | float]:
