@@ -15,6 +15,7 @@ from appearance_opt.asset.rig import Skin
 from appearance_opt.errors import InputError
 from appearance_opt.initial.sphere import sphere
 from appearance_opt.jobs.animate import AnimateResult, animate
+from appearance_opt.jobs.compare import compare
 from appearance_opt.latent.build import latent_of
 from appearance_opt.latent.positions import POSITIONS
 from appearance_opt.latent.skinning import WEIGHTS, BoneFrames
@@ -173,3 +174,21 @@ def test_what_cannot_be_animated_is_refused(small: Asset, tmp_path: Path) -> Non
     with pytest.raises(InputError, match="OBJ files hold no skeleton"):
         animate(small, tmp_path / "x.obj", **QUICK)
     assert not list(tmp_path.iterdir())
+
+
+def test_comparisons_pose_both(small: Asset, result: tuple[AnimateResult, Path]) -> None:
+    _, folder = result
+    light = load(folder / "light.glb", keep_rig=True)
+    quick = {"views": 3, "resolution": 48, "samples": 1}
+    found = compare(small, light, clip="look", **quick)
+    assert [f for f, _ in found.frames] == [0, 12, 24]
+    assert found.reference.shape == (3, 48, 48, 4)
+    assert "PSNR at frame 12" in "\n".join(found.lines())
+    one = compare(small, small, clip="walk", frame=5, **quick)
+    assert {f for f, _ in one.frames} == {5} and one.metrics.psnr_covered > 60
+    with pytest.raises(InputError, match="there is no clip 'hop'"):
+        compare(small, light, clip="hop", **quick)
+    with pytest.raises(InputError, match="no animation in it; leave --clip out"):
+        compare(bumpy_sphere(1000, 16), light, clip="look", **quick)
+    with pytest.raises(InputError, match="--frame needs --clip"):
+        compare(small, light, frame=3, **quick)

@@ -176,7 +176,7 @@ def skinned(tmp_path: Path, weights: np.ndarray, joints: list[dict], inverse: np
     }
     write_glb(tmp_path / "x.glb", *document(attributes, None, (inverse.reshape(2, 16),), **top))
     asset = load(tmp_path / "x.glb")
-    assert "skins: the rest pose is kept, skinning dropped" in asset.notes
+    assert "skins: the pose at rest is kept; `appearance-opt animate` keeps skins" in asset.notes
     return asset.meshes[0]
 
 

@@ -208,7 +208,7 @@ def test_skinned_meshes_keep_their_bind_pose(tmp_path: Path) -> None:
 """
     asset = load(written(tmp_path, text))
     np.testing.assert_allclose(asset.meshes[0].positions.min(axis=0), [0, 5, 10])
-    assert "'/figure/m': the bind pose is kept, skinning dropped" in asset.notes
+    assert "'/figure/m': the bind pose is kept; `appearance-opt animate` keeps skins" in asset.notes
     assert any(
         note.startswith("'/figure/m': blend shapes: the shape of their default")
         for note in asset.notes

@@ -96,8 +96,8 @@ class _Reader:
         rig = None if self.rig is None else self.rig.rig()
         if not self.keep_rig:
             for kind, what in (
-                ("skins", "skins: the rest pose is kept, skinning dropped"),
-                ("animations", "animations dropped"),
+                ("skins", "skins: the pose at rest is kept; `appearance-opt animate` keeps skins"),
+                ("animations", "animations dropped; `appearance-opt animate` keeps them"),
             ):
                 if self.document.items(kind):
                     self.note(what)

@@ -323,7 +323,9 @@ class _Reader:
         if not binding.GetJointIndicesPrimvar().HasValue():
             return world
         if self.rig is None:
-            self.note(f"'{prim.GetPath()}': the bind pose is kept, skinning dropped")
+            self.note(
+                f"'{prim.GetPath()}': the bind pose is kept; `appearance-opt animate` keeps skins"
+            )
         skeleton = binding.GetInheritedSkeleton()
         bound = binding.GetGeomBindTransformAttr().Get(self.time)
         if not skeleton:

@@ -24,12 +24,14 @@ if TYPE_CHECKING:
 @dataclass
 class Comparison:
     """``metrics`` over the views; images (B, H, W, 4) premultiplied linear radiance and coverage;
-    ``notes``: what the loader dropped, repaired or assumed."""
+    ``notes``: what the loader dropped, repaired or assumed; ``frames``: of an animation, the frame
+    of each view and its PSNR over covered pixels in dB."""
 
     metrics: Metrics
     reference: NDArray[np.float32]
     candidate: NDArray[np.float32]
     notes: tuple[str, ...] = ()
+    frames: tuple[tuple[float, float], ...] = ()
 
     def lines(self) -> list[str]:
         """The metrics for a terminal."""
@@ -41,11 +43,12 @@ class Comparison:
             f"pixels noticed        {100 * m.noticed:7.2f} %",
             f"silhouette IoU        {m.silhouette_iou:7.4f}",
             f"silhouette shift      {m.silhouette_shift:7.3f} px",
+            *(f"PSNR at frame {f:<8g}{psnr:7.2f} dB" for f, psnr in self.frames),
         ]
 
     def record(self) -> dict[str, Any]:
         """The metrics for JSON."""
-        return asdict(self.metrics)
+        return asdict(self.metrics) | ({"frames": self.frames} if self.frames else {})
 
 
 def compare_local(

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
     from appearance_opt.latent.mesh import LatentMesh
     from appearance_opt.reference.survey import Triangles
+    from appearance_opt.render.passing import Scene
     from appearance_opt.views import ViewSampler
 
 VISIBILITY_VIEWS = 160
@@ -83,9 +84,22 @@ class Decimation:
         self.weight, self.visible = np.ones(count), np.ones(count, bool)
         if sampler is not None:
             tell("looking for what can be seen")
-            pixels = pixel_counts(scene, count, sampler.held_out(VISIBILITY), VISIBILITY_VIEWS)
+            pixels = self._pixels(heavy, scene, count, sampler.held_out(VISIBILITY))
             self.weight, seen = importance(self.positions, self.faces, pixels)
             self.visible = seen if seen.sum() >= triangles else self.visible
+
+    def _pixels(
+        self, heavy: Triangles, scene: Scene, count: int, sampler: ViewSampler
+    ) -> NDArray[np.int64]:
+        """(F,) pixels in which each face was seen, at all poses."""
+        if self.coarse or not heavy.poses:
+            return pixel_counts(scene, count, sampler, VISIBILITY_VIEWS)
+        each = max(VISIBILITY_VIEWS // len(heavy.poses), 8)
+        free = replace(sampler, hull=None)  # which is that of the scene
+        total = np.zeros(count, np.int64)
+        for k, posed in enumerate(heavy.poses):
+            total += pixel_counts(posed, count, replace(free, seed=free.seed + k), each)
+        return total
 
     def charts(self, weight: NDArray) -> LatentMesh:
         """The mesh decimated with these importances of its faces (F,), its charts not yet packed.

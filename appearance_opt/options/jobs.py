@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from appearance_opt.errors import InputError
 from appearance_opt.options.animation import AnimationOptions
 from appearance_opt.options.baking import BakingOptions
 from appearance_opt.options.files import OutputOptions
@@ -128,8 +129,19 @@ class CompareOptions(Record):
         panel="Views",
         choices=RENDERERS,
     )
+    clip: str | None = option(
+        None, "Pose both by this clip, each view at another frame.", panel="Views", metavar="NAME"
+    )
+    frame: float | None = option(
+        None, "Frame of the clip for all views, at the rate of the reference.", panel="Views"
+    )
     seed: int = option(0, "Seed of views and lights.", panel="Views", low=0)
     device: str = _device()
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.frame is not None and self.clip is None:
+            raise InputError("--frame needs --clip NAME")
 
 
 @dataclass(frozen=True)

@@ -72,13 +72,15 @@ class Appearance:
 class Triangles:
     """The surface as triangles, from which starts are decimated. ``positions`` (V, 3); ``faces``
     (F, 3); ``single`` (F,): faces that are seen from their front only; ``scene``: the same for
-    rays; ``owner`` (F,): number of the part to which each belongs, None for one part."""
+    rays; ``owner`` (F,): number of the part to which each belongs, None for one part; ``poses``:
+    where they are seen instead, if they move."""
 
     positions: NDArray[np.float32]
     faces: NDArray[np.int32]
     single: NDArray[np.bool_]
     scene: Scene
     owner: NDArray[np.int32] | None = None
+    poses: tuple[Scene, ...] = ()
 
 
 class Survey(Protocol):
@@ -153,10 +155,11 @@ class Place:
 
 
 class MeshSurvey:
-    """A ``Survey`` of the mesh that a ``MeshReference`` draws."""
+    """A ``Survey`` of the mesh that a ``MeshReference`` draws. ``poses``: see
+    ``Triangles``."""
 
-    def __init__(self, reference: MeshReference) -> None:
-        self._reference = reference
+    def __init__(self, reference: MeshReference, poses: tuple[Scene, ...] = ()) -> None:
+        self._reference, self._poses = reference, poses
 
     @property
     def bounds(self) -> NDArray[np.floating]:
@@ -185,7 +188,8 @@ class MeshSurvey:
     def triangles(self) -> Triangles:
         """See ``Survey``."""
         r = self._reference
-        return Triangles(r.merged.positions, r.merged.faces, r.single, r.scene, r.owner)
+        m = r.merged
+        return Triangles(m.positions, m.faces, r.single, r.scene, r.owner, self._poses)
 
     def spread(self, count: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """See ``Survey``."""

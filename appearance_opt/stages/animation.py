@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from appearance_opt.asset.batch import Batch
 from appearance_opt.asset.influences import on_bone
 from appearance_opt.asset.normals import summed_normals
 from appearance_opt.asset.origin import ZERO
@@ -32,6 +31,9 @@ if TYPE_CHECKING:
 
 MOST = 48
 """Frames of a fit, unless they are named: neighbours hardly differ."""
+
+LOOKED_AT = 8
+"""Frames that tell what is ever seen."""
 
 POINTS = 4000
 """Vertices that tell where a frame lies."""
@@ -90,7 +92,7 @@ class Animation:
         reference = AnimatedReference(replace(bind.local(asset), rig=None), local)
         sampler = views_around(reference.bind.merged.positions, views.seed, views.light)
         subject = Subject(
-            reference.bind, sampler, bind, MeshSurvey(reference.bind), replace(asset, rig=None)
+            reference.bind, sampler, bind, _survey(reference, local), replace(asset, rig=None)
         )
         samplers = tuple(
             views_around(place.to_local(p), views.seed, views.light)
@@ -125,22 +127,32 @@ class Animation:
 
     def transfer_skin(self, mesh: LatentMesh, places: int) -> Skin:
         """Weights of a light mesh from those of the asset, with room for ``places`` bones each."""
-        batch = Batch(self.reference.completed)
-        widest = max(m.skin.bones.shape[1] for m in batch.meshes if m.skin is not None)
-        skins = [_widened(m.skin, widest) for m in batch.meshes if m.skin is not None]
-        whole = Skin(
-            np.concatenate([s.bones for s in skins]), np.concatenate([s.weights for s in skins])
-        )
+        merged = self.reference.bind.merged
         normals = summed_normals(mesh.positions, mesh.faces, welded=True)
         skin = transfer_influences(
             mesh.positions,
             normals,
-            batch.joined("positions"),
-            batch.faces,
-            whole,
+            merged.positions,
+            merged.faces,
+            joined_skin(self.reference),
             len(self.rig.bone_nodes),
         )
         return support_of(skin, mesh.faces, places)
+
+
+def joined_skin(reference: AnimatedReference) -> Skin:
+    """The influences of the vertices of all meshes."""
+    skins = [m.skin for m in reference.completed if m.skin is not None]
+    widest = max(s.bones.shape[1] for s in skins)
+    wide = [_widened(s, widest) for s in skins]
+    return Skin(np.concatenate([s.bones for s in wide]), np.concatenate([s.weights for s in wide]))
+
+
+def _survey(reference: AnimatedReference, matrices: NDArray) -> MeshSurvey:
+    """The surface of the bind pose, which is seen at some of the frames."""
+    some = np.unique(np.linspace(0, len(matrices) - 1, LOOKED_AT).round().astype(int))
+    poses = tuple(reference.at(int(k)).scene for k in some)
+    return MeshSurvey(reference.bind, poses)
 
 
 def anchored(asset: Asset) -> tuple[Asset, Rig]:
