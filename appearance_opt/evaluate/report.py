@@ -190,7 +190,7 @@ def curve_svg(
     low, high = min(ys), max(ys)
     span = max(high - low, 0.1)
     low, high = low - 0.1 * span, high + 0.1 * span
-    left, bottom, right, top = 56, 34, 12, 10
+    left, bottom, right, top = 56, 34, 24, 10
 
     def at(x: float, y: float) -> tuple[float, float]:
         px = left + (width - left - right) * x / max(xs[-1], 1e-9)

@@ -221,7 +221,7 @@
     return scene;
   }
 
-  const begin = () => start().catch((fault) => { message.textContent = `The 3D view cannot be shown: ${fault.message}.`; });
+  const begin = () => start().catch((fault) => { message.textContent = `The 3D view cannot be shown: ${fault.message.replace(/\.$/, "")}.`; });
   const watcher = new IntersectionObserver((entries) => {
     if (entries.some((e) => e.isIntersecting)) { watcher.disconnect(); begin(); }
   }, { rootMargin: '200px' });
