@@ -88,6 +88,14 @@ def split_where_cancelled(
     )
 
 
+def edge_basis(normals: NDArray, edges: NDArray) -> tuple[NDArray, NDArray]:
+    """Unit vectors x, y (N, 3), perpendicular to unit ``normals`` as z: x along the projection of
+    ``edges`` (N, 3)."""
+    z = np.asarray(normals, np.float64)
+    x = unit(edges - z * np.sum(z * edges, axis=1, keepdims=True))
+    return x, np.cross(z, x)
+
+
 def unit(v: NDArray) -> NDArray:
     """v / |v|; zero where v is zero."""
     length = np.linalg.norm(v, axis=-1, keepdims=True)

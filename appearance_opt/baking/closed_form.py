@@ -91,7 +91,11 @@ def bake(survey: Survey, mesh: LatentMesh, settings: Settings) -> BakedMaps:
     values = np.empty((size, size, len(names)), np.float32)
     found, covered, hidden = (np.empty((size, size), bool) for _ in range(3))
     with dr.suspend_grad():
-        reach = automatic_reach(survey, mesh) if settings.reach is None else settings.reach
+        reach = (
+            automatic_reach(survey, mesh.positions, mesh.faces)
+            if settings.reach is None
+            else settings.reach
+        )
         run = _Run(survey, TexelPoints(mesh, size, settings.samples), settings, reach)
         for row in range(0, size, run.points.rows):
             sums = run.band(row)[: size - row]

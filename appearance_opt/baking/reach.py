@@ -12,7 +12,8 @@ from appearance_opt.render import upload
 from appearance_opt.render.passing import meet
 
 if TYPE_CHECKING:
-    from appearance_opt.latent.mesh import LatentMesh
+    from numpy.typing import NDArray
+
     from appearance_opt.reference.survey import Survey
 
 REACH = 4.0
@@ -27,18 +28,18 @@ POINTS = 50_000
 """Points of the reference whose distance is measured, about."""
 
 
-def automatic_reach(survey: Survey, mesh: LatentMesh) -> float:
+def automatic_reach(survey: Survey, positions: NDArray, faces: NDArray) -> float:
     """The automatic cage: ``REACH`` times the distance within which nearly all of the reference
     lies."""
     diagonal = float(np.linalg.norm(np.ptp(survey.bounds, axis=0)))
-    return max(REACH * deviation(survey, mesh), LEAST * diagonal)
+    return max(REACH * deviation(survey, positions, faces), LEAST * diagonal)
 
 
-def deviation(survey: Survey, mesh: LatentMesh) -> float:
+def deviation(survey: Survey, positions: NDArray, faces: NDArray) -> float:
     """Distance within which nearly all of the reference (its quantile ``QUANTILE``) lies from the
-    simple mesh, measured along the reference's normals."""
+    simple mesh, ``positions`` (V, 3) and ``faces`` (F, 3), measured along the reference's normals."""
     p, normals = survey.spread(POINTS)
-    scene = upload.scene_of(mesh.positions, mesh.faces)
+    scene = upload.scene_of(positions, faces)
     position, normal = mi.Point3f(p.T), mi.Vector3f(normals.T)
     out, back = (meet(scene, mi.Ray3f(position, n)).t for n in (normal, -normal))
     nearest = np.array(dr.fmin(out, back))

@@ -55,8 +55,11 @@ class TexelPoints:
         self.surface = self._topology.surface(mi.Float(positions.ravel()))
         self.atlas = atlas_scene(mesh)
         self._directions: mi.Float | None = None
-        if mesh.normals is not None:
-            self._directions = upload.packets(4, vertex_normals(positions, mesh.faces))
+        follows = mesh.normal_faces is not None or mesh.normal_local is not None
+        if follows or mesh.normals is not None:
+            # a latent's vertices are one at each place, but where sheets lie back to back
+            smooth = vertex_normals(positions, mesh.faces, welded=mesh.normals is None)
+            self._directions = upload.packets(4, smooth[mesh.shading_vertex])
 
     @cached_property
     def scene(self) -> Scene:

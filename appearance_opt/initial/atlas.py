@@ -9,12 +9,19 @@ import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
+from appearance_opt.asset.normals import summed_normals
 from appearance_opt.initial.sheets import separate
+from appearance_opt.initial.vertex_normals import VertexNormals
 from appearance_opt.latent.mesh import LatentMesh
 
 if TYPE_CHECKING:
     import xatlas
     from numpy.typing import NDArray
+
+    from appearance_opt.initial.vertex_normals import Follow
+
+ALWAYS = 1001.0
+"""Weight of a seam that no chart runs across."""
 
 GUTTER = 4  # docs/trials.md: texels
 """Empty texels between charts, enough for one mip level and its bilinear lookups."""
@@ -34,19 +41,26 @@ def unwrap(
     resolution: int,
     gutter: int = GUTTER,
     single: NDArray | None = None,
+    follow: Follow | None = None,
 ) -> LatentMesh:
     """Charts for all faces, with equally many texels per area, packed for a texture of
-    ``resolution`` texels."""
+    ``resolution`` texels. ``follow``: see ``make_charts``."""
     return pack_charts(
-        make_charts(positions, faces, single), np.ones(len(faces)), resolution, gutter
+        make_charts(positions, faces, single, follow), np.ones(len(faces)), resolution, gutter
     )
 
 
-def make_charts(positions: NDArray, faces: NDArray, single: NDArray | None = None) -> LatentMesh:
+def make_charts(
+    positions: NDArray,
+    faces: NDArray,
+    single: NDArray | None = None,
+    follow: Follow | None = None,
+) -> LatentMesh:
     """Charts for all faces. UVs are as long as what they stand for (in units of the longest side of
     the mesh's box), and charts lie side by side, anywhere. ``single`` (F,): faces that are seen
     from their front only, None for none; where such sheets lie back to back, each side gets
-    vertices and charts of its own (see ``sheets``).
+    vertices and charts of its own (see ``sheets``). ``follow`` gives its vertex normals to the mesh
+    (positions and faces); charts end at its creases.
 
     glTF convention (v downward). Render vertices are also split where a vertex lies on charts of
     both handednesses, so that each has one tangent basis.
@@ -57,19 +71,27 @@ def make_charts(positions: NDArray, faces: NDArray, single: NDArray | None = Non
     centre = (positions.min(axis=0) + positions.max(axis=0)) / 2
     scale = max(float(np.ptp(positions, axis=0).max()), 1e-300)
     sheets = separate(positions, faces, single)
+    normals = VertexNormals() if follow is None else follow(sheets.positions, sheets.faces)
     atlas = xatlas.Atlas()
     unit = ((sheets.positions - centre) / scale).astype(np.float32)
+    corners, directions = sheets.faces, None
+    if normals.faces is not None:
+        # to xatlas vertices at one place that have different normals are a seam
+        unit, corners = unit[normals.vertex], normals.faces
+        directions = summed_normals(unit, corners, welded=True)
     # vertices at one place are one to xatlas: what lies back to back is a mesh of its own
     parts = [np.flatnonzero(~sheets.behind), np.flatnonzero(sheets.behind)]
     parts = [own for own in parts if len(own)]
     for own in parts:
-        atlas.add_mesh(
-            np.ascontiguousarray(unit), np.ascontiguousarray(sheets.faces[own], np.uint32)
-        )
+        indices = np.ascontiguousarray(corners[own], np.uint32)
+        atlas.add_mesh(np.ascontiguousarray(unit), indices, directions)
     chart = xatlas.ChartOptions()
     chart.max_iterations = 2
+    chart.normal_seam_weight = ALWAYS
     atlas.generate(chart_options=chart, pack_options=_pack_options(1024, GUTTER, 0.0))
     vertex, frames, uvs = _join(atlas, parts)
+    if normals.vertex is not None:
+        vertex = normals.vertex[vertex]
     # xatlas stretches the texture, which is as wide and high as it likes, to the unit square
     side = np.array([atlas.width, atlas.height], np.float32) / np.float32(
         max(atlas.texels_per_unit, 1e-30)
@@ -81,12 +103,30 @@ def make_charts(positions: NDArray, faces: NDArray, single: NDArray | None = Non
         frame_faces=np.asarray(frames, np.int32),
         uvs=np.nan_to_num(np.asarray(uvs, np.float32)) * side,
         single=single if single is not None and single.any() else None,
+        normal_vertex=normals.vertex,
+        normal_faces=normals.faces,
+        normal_local=normals.local,
+        normal_edge=normals.edge,
     )
     left = uv_areas(charts) <= 0
-    return (
-        _with_single_faces(charts, left, (sheets.positions - centre) / scale)
-        if left.any()
-        else charts
+    if left.any():
+        charts = _with_single_faces(charts, left, (sheets.positions - centre) / scale)
+    return _split_at_creases(charts)
+
+
+def _split_at_creases(mesh: LatentMesh) -> LatentMesh:
+    """The mesh with a render vertex for each normal that is met at one: where a crease ends within
+    a chart."""
+    if mesh.normal_faces is None:
+        return mesh
+    normal, frame = mesh.normal_faces.ravel().astype(np.int64), mesh.frame_faces.ravel()
+    pairs, faces = np.unique(frame * (normal.max() + 1) + normal, return_inverse=True)
+    first = pairs // (normal.max() + 1)
+    return replace(
+        mesh,
+        frame_vertex=mesh.frame_vertex[first],
+        frame_faces=faces.reshape(-1, 3).astype(np.int32),
+        uvs=mesh.uvs[first],
     )
 
 
@@ -156,12 +196,13 @@ def pack_charts(
         texels = max(texels * resolution / (atlas.width * atlas.height) ** 0.5, SMALLEST * guess)
     atlas = _pack(scaled, _pack_options(resolution, gutter, texels, tight))
     vertex, faces, uvs = atlas[0]
-    return replace(
+    packed = replace(
         charts,
         frame_vertex=charts.frame_vertex[np.asarray(vertex)],
         frame_faces=np.asarray(faces, np.int32),
         uvs=np.asarray(uvs, np.float32),
     )
+    return _split_at_creases(packed)
 
 
 def _pack(charts: LatentMesh, options: xatlas.PackOptions) -> xatlas.Atlas:

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from appearance_opt.initial.vertex_normals import Follow
     from appearance_opt.latent.mesh import LatentMesh
     from appearance_opt.reference.survey import Triangles
     from appearance_opt.render.passing import Scene
@@ -101,9 +102,9 @@ class Decimation:
             total += pixel_counts(posed, count, replace(free, seed=free.seed + k), each)
         return total
 
-    def charts(self, weight: NDArray) -> LatentMesh:
+    def charts(self, weight: NDArray, follow: Follow | None = None) -> LatentMesh:
         """The mesh decimated with these importances of its faces (F,), its charts not yet packed.
-        Raises InputError if nothing is left of it."""
+        ``follow``: see ``make_charts``. Raises InputError if nothing is left of it."""
         single = self.single[self.visible]
         owner = None if self.owner is None else self.owner[self.visible]
         positions, faces, source = decimate_with_source(
@@ -118,5 +119,5 @@ class Decimation:
         if not len(faces):
             raise InputError("nothing is left of this mesh at that budget; ask for more triangles")
         self._tell(f"unwrapping {len(faces):,} triangles")
-        charts = make_charts(positions, faces, single[source])
+        charts = make_charts(positions, faces, single[source], follow)
         return charts if owner is None else replace(charts, owner=owner[source])

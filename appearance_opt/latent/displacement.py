@@ -16,7 +16,13 @@ import mitsuba as mi
 import numpy as np
 
 from appearance_opt.latent import mesh_ops
-from appearance_opt.latent.mesh import LatentMesh, corners_of, edges_around, local_edge_length
+from appearance_opt.latent.mesh import (
+    LatentMesh,
+    corners_of,
+    edges_around,
+    local_edge_length,
+    without_creases,
+)
 from appearance_opt.latent.parts import Part, Pose
 from appearance_opt.latent.subdivision import tessellate
 from appearance_opt.latent.texels import PackedMaps
@@ -44,7 +50,8 @@ class Tessellator:
     def __init__(self, base: LatentMesh, level: int) -> None:
         fine = tessellate(base, level)
         self.mesh = fine.mesh
-        self._base = corners_of(base)
+        # along the smooth normals of the faces, whatever it is shaded with: no gap may open
+        self._base = corners_of(without_creases(base))
         self._parents = [
             mi.UInt32(np.ascontiguousarray(fine.parents[:, k], np.uint32)) for k in range(3)
         ]

@@ -7,7 +7,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from appearance_opt.asset.normals import split_where_cancelled, summed_normals
+from appearance_opt.asset.normals import (
+    edge_basis,
+    split_where_cancelled,
+    summed_normals,
+    unit,
+)
 from appearance_opt.asset.packing import EMISSION, pack_emission
 from appearance_opt.asset.tangents import split_and_tangents
 from appearance_opt.asset.types import Asset, Material, Mesh, Texture
@@ -35,7 +40,7 @@ def to_asset(
     tangents MikkTSpace's: what the renderer of the fit uses, so that the maps mean the same in
     another one. ``skin``: of the welded vertices."""
     p, tangents = positions[mesh.frame_vertex], None
-    normals = summed_normals(positions, mesh.faces, welded=True)[mesh.frame_vertex]
+    normals = shading_normals(mesh, positions)[mesh.frame_normal]
     index, faces, n = split_where_cancelled(p, mesh.frame_faces, normals)
     p, uv, vertex = p[index], mesh.uvs[index], mesh.frame_vertex[index]
     if np.ndim(maps.get("normal_x", 0.0)):
@@ -70,6 +75,16 @@ def _by_owner(mesh: Mesh, owner: NDArray[np.int32] | None) -> list[tuple[Mesh, N
         part = mesh if len(own) == len(owner) else _part(mesh, own)
         out.append((replace(part, node=None if node < 0 else node), own))
     return out
+
+
+def shading_normals(mesh: LatentMesh, positions: NDArray) -> NDArray[np.float32]:
+    """(G, 3) the vertex normals of a latent at ``positions`` (V, 3), zero where there are none."""
+    out = summed_normals(positions[mesh.shading_vertex], mesh.shading_faces, welded=True)
+    if mesh.normal_local is None or mesh.normal_edge is None:
+        return out
+    x, y = edge_basis(out, positions[mesh.normal_edge] - positions[mesh.shading_vertex])
+    c = mesh.normal_local.astype(np.float64)
+    return unit(x * c[:, :1] + y * c[:, 1:2] + out * c[:, 2:]).astype(np.float32)
 
 
 def _by_side(mesh: Mesh, single: NDArray[np.bool_], one_way: Material) -> tuple[Mesh, ...]:

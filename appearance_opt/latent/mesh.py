@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -42,6 +42,16 @@ class LatentMesh:
     ``single`` (F,): faces that are seen from their front only; None: all are seen from both sides.
     ``owner`` (F,): number of the node of the asset to which each face belongs, -1 for none; None
     where there are no nodes.
+
+    ``normal_vertex`` (G,), ``normal_faces`` (F, 3), given together: of G vertex normals, the vertex
+    of each, and those of the corners of each face; the first V are at the vertices of their number.
+    Corners of one vertex that have different normals meet at a crease, and have render vertices of
+    their own. None: each vertex has one normal, and its number.
+
+    ``normal_local`` (G, 3), ``normal_edge`` (G,), given together: vertex normals that are not those
+    of the faces around, as unit vectors in a basis that moves and turns with the mesh (see
+    ``mesh_ops.vertex_normals``), and the vertex at the other end of the edge that it is aligned
+    with.
     """
 
     positions: NDArray[np.float32]
@@ -53,6 +63,31 @@ class LatentMesh:
     tangents: NDArray[np.float32] | None = None
     single: NDArray[np.bool_] | None = None
     owner: NDArray[np.int32] | None = None
+    normal_vertex: NDArray[np.int32] | None = None
+    normal_faces: NDArray[np.int32] | None = None
+    normal_local: NDArray[np.float32] | None = None
+    normal_edge: NDArray[np.int32] | None = None
+
+    @property
+    def shading_faces(self) -> NDArray[np.int32]:
+        """(F, 3) the normals of the corners of each face."""
+        return self.faces if self.normal_faces is None else self.normal_faces
+
+    @property
+    def shading_vertex(self) -> NDArray[np.int32]:
+        """(G,) the vertex of each normal."""
+        if self.normal_vertex is None:
+            return np.arange(len(self.positions), dtype=np.int32)
+        return self.normal_vertex
+
+    @property
+    def frame_normal(self) -> NDArray[np.int32]:
+        """(R,) the normal of each render vertex."""
+        if self.normal_faces is None:
+            return self.frame_vertex
+        out = self.frame_vertex.copy()
+        out[self.frame_faces.ravel()] = self.normal_faces.ravel()
+        return out
 
 
 class LatentTopology:
@@ -63,7 +98,7 @@ class LatentTopology:
         self.mesh = mesh
         self.tangents = tangents
         self.corners = corners_of(mesh)
-        self.faces = upload.index_packets(mesh.faces)
+        self.faces = upload.index_packets(mesh.shading_faces)
         self.frame_faces = upload.index_packets(mesh.frame_faces)
         # silhouettes run along welded edges: a seam is none
         self.welded_faces = (
@@ -86,7 +121,7 @@ class LatentTopology:
         if self._fixed is not None:
             return self._fixed
         normals = mesh_ops.vertex_normals(positions, self.corners)
-        vertices = mesh_ops.packed_vertices(positions, normals)
+        vertices = mesh_ops.packed_vertices(positions, normals, self.corners.normal_vertex)
         uv = dr.unravel(mi.Point2f, self.corners.uvs)
         if self.tangents:
             t = mesh_ops.vertex_tangents(positions, normals, self.corners)
@@ -119,6 +154,11 @@ class LatentTopology:
         return upload.surface_of(mesh)
 
 
+def without_creases(mesh: LatentMesh) -> LatentMesh:
+    """The mesh with one normal per vertex, the mean of the faces around."""
+    return replace(mesh, normal_vertex=None, normal_faces=None, normal_local=None, normal_edge=None)
+
+
 def weld_faces(positions: NDArray, faces: NDArray) -> NDArray[np.intp]:
     """(F, 3) the same faces through one representative vertex per place."""
     first, place = weld(positions)
@@ -127,14 +167,27 @@ def weld_faces(positions: NDArray, faces: NDArray) -> NDArray[np.intp]:
 
 def corners_of(mesh: LatentMesh) -> Corners:
     """Connectivity of a mesh on the device."""
-    corner = [mi.UInt32(np.ascontiguousarray(mesh.faces[:, k], np.uint32)) for k in range(3)]
-    frame = [mi.UInt32(np.ascontiguousarray(mesh.frame_faces[:, k], np.uint32)) for k in range(3)]
+    vertex = _columns(mesh.faces)
+    creased = mesh.normal_faces is not None
+    local, edge = mesh.normal_local, mesh.normal_edge
     return Corners(
-        vertex=(corner[0], corner[1], corner[2]),
-        frame=(frame[0], frame[1], frame[2]),
-        frame_vertex=mi.UInt32(np.ascontiguousarray(mesh.frame_vertex, np.uint32)),
+        vertex=vertex,
+        normal=_columns(mesh.shading_faces) if creased else vertex,
+        frame=_columns(mesh.frame_faces),
+        normal_vertex=_indices(mesh.shading_vertex) if creased else None,
+        frame_normal=_indices(mesh.frame_normal),
         uvs=mi.Float(np.ascontiguousarray(mesh.uvs, np.float32).ravel()),
+        edge=None if edge is None else _indices(edge),
+        local=None if local is None else mi.Vector3f(np.ascontiguousarray(local.T)),
     )
+
+
+def _columns(faces: NDArray) -> tuple[mi.UInt32, mi.UInt32, mi.UInt32]:
+    return _indices(faces[:, 0]), _indices(faces[:, 1]), _indices(faces[:, 2])
+
+
+def _indices(values: NDArray) -> mi.UInt32:
+    return mi.UInt32(np.ascontiguousarray(values, np.uint32))
 
 
 def handedness(mesh: LatentMesh) -> NDArray[np.float32]:

@@ -14,7 +14,7 @@ from appearance_opt.initial.decimation import Decimation
 from appearance_opt.initial.density import chart_scales
 from appearance_opt.initial.reallocate import StartError, weights
 from appearance_opt.stages.displacement import gutter
-from appearance_opt.stages.start import Start, require_survey, transfer_appearance
+from appearance_opt.stages.start import Start, normals_of, require_survey, transfer_appearance
 from appearance_opt.views import START
 
 if TYPE_CHECKING:
@@ -104,7 +104,7 @@ class _Starts:
 
     def make(self, weight: NDArray) -> Start:
         """The reference decimated with these importances of its faces (F,)."""
-        charts = self.decimation.charts(weight)
+        charts = self.decimation.charts(weight, normals_of(self.survey, self.options))
         return self._pack_and_bake(charts, np.ones(len(charts.faces)), False)
 
     def move_triangles(self, start: Start, judge: StartError, rounds: int) -> tuple[Start, float]:

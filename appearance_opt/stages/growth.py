@@ -36,7 +36,13 @@ from appearance_opt.reference.survey import MeshSurvey
 from appearance_opt.stages.displacement import flat_map
 from appearance_opt.stages.fitting import VALIDATION_VIEWS, clean_maps
 from appearance_opt.stages.run import Run
-from appearance_opt.stages.start import Start, require_survey, select_told, transfer_appearance
+from appearance_opt.stages.start import (
+    Start,
+    normals_of,
+    require_survey,
+    select_told,
+    transfer_appearance,
+)
 from appearance_opt.views import VALIDATION
 
 if TYPE_CHECKING:
@@ -129,7 +135,9 @@ def grow_start(
     positions, faces = decimate(grown.positions, grown.faces, triangles)
     if not len(faces):
         raise InputError("nothing is left of the grown mesh at that budget; ask for more triangles")
-    start = transfer_appearance(source, unwrap(positions, faces, options.texture.size), options)
+    follow = normals_of(source, options)
+    atlas = unwrap(positions, faces, options.texture.size, follow=follow)
+    start = transfer_appearance(source, atlas, options)
     return replace(start, grown=True), result.interrupted
 
 
@@ -146,7 +154,13 @@ def mend_start(
     survey = require_survey(subject)
     maps = transfer_appearance(survey, spoilt, small).maps
     model, result = _fit_shape(subject, options, spoilt, maps, MENDING, effort)
-    mesh = unwrap(model.host_positions(), spoilt.faces, options.texture.size, single=spoilt.single)
+    mesh = unwrap(
+        model.host_positions(),
+        spoilt.faces,
+        options.texture.size,
+        single=spoilt.single,
+        follow=normals_of(survey, options),
+    )
     return transfer_appearance(survey, mesh, options), result.interrupted
 
 

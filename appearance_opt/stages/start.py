@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -14,6 +15,7 @@ from appearance_opt.errors import InputError
 from appearance_opt.initial.atlas import unwrap
 from appearance_opt.initial.influences import closest_points
 from appearance_opt.initial.transfer import transfer
+from appearance_opt.initial.vertex_normals import follow_normals
 from appearance_opt.latent.mesh import LatentMesh
 from appearance_opt.render.material import COLORS, UNLIT
 from appearance_opt.stages.displacement import (
@@ -33,6 +35,7 @@ if TYPE_CHECKING:
     from appearance_opt.asset.origin import Origin
     from appearance_opt.asset.types import Asset
     from appearance_opt.config import SimplifyOptions
+    from appearance_opt.initial.vertex_normals import Follow
     from appearance_opt.placement import Placement
     from appearance_opt.reference.subject import Subject
     from appearance_opt.reference.survey import Survey, Triangles
@@ -98,6 +101,14 @@ def localize(mesh: LatentMesh, placement: Placement, origin: Origin) -> LatentMe
     """A mesh of the world, relative to ``origin``, in local coordinates."""
     local = placement.relative_to(origin).to_local(mesh.positions)
     return replace(mesh, positions=local.astype(np.float32))
+
+
+def normals_of(survey: Survey, options: SimplifyOptions) -> Follow | None:
+    """What gives a mesh vertex normals that follow the reference's. None where nothing is lit, and
+    for displaced meshes: the normals of those are the ones of the displaced surface."""
+    if survey.unlit or options.displacement.fitted:
+        return None
+    return partial(follow_normals, survey)
 
 
 def select_told(unlit: bool, maps: Mapping[str, NDArray | float]) -> dict[str, NDArray | float]:
@@ -202,6 +213,7 @@ def atlas_of(
         options.texture.size,
         gutter(len(faces), options),
         single,
+        None if survey is None else normals_of(survey, options),
     )
     return mesh, parts.describe_kept(
         "of --init are left out: those of the input pass into the result"

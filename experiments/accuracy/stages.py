@@ -158,10 +158,14 @@ def geometry(one: Precision, two: Precision) -> list[Line]:
         normals, tangents = [], []
         for p in (one, two):
             c = p.mesh_ops.Corners(
-                tuple(corner),
-                tuple(frame),
-                mi.UInt32(mesh.frame_vertex.astype(np.uint32)),
-                p.scalar(mesh.uvs.ravel()),
+                vertex=tuple(corner),
+                normal=tuple(corner),
+                frame=tuple(frame),
+                normal_vertex=None,
+                frame_normal=mi.UInt32(mesh.frame_vertex.astype(np.uint32)),
+                uvs=p.scalar(mesh.uvs.ravel()),
+                edge=None,
+                local=None,
             )
             n = p.mesh_ops.vertex_normals(p.scalar(positions), c)
             normals.append(n)
