@@ -10,11 +10,13 @@ if TYPE_CHECKING:
         AnimateOptions,
         BakeOptions,
         CompareOptions,
+        ConvertOptions,
         InspectOptions,
         JointOptions,
         SimplifyOptions,
         animate_options,
         bake_options,
+        convert_options,
         joint_options,
         simplify_options,
     )
@@ -29,6 +31,7 @@ if TYPE_CHECKING:
     from appearance_opt.jobs.animate import AnimateResult, animate
     from appearance_opt.jobs.bake import bake
     from appearance_opt.jobs.compare import compare
+    from appearance_opt.jobs.convert import convert
     from appearance_opt.jobs.fit import fit
     from appearance_opt.jobs.inspect import Inspection, inspect
     from appearance_opt.jobs.joint import joint
@@ -58,6 +61,7 @@ _HOMES = {
     "BakeResult": "appearance_opt.jobs.result",
     "BakingOptions": "appearance_opt.options.baking",
     "CompareOptions": "appearance_opt.config",
+    "ConvertOptions": "appearance_opt.config",
     "Comparison": "appearance_opt.evaluate.comparison",
     "DisplacementOptions": "appearance_opt.options.maps",
     "DivergedError": "appearance_opt.errors",
@@ -80,6 +84,8 @@ _HOMES = {
     "bake": "appearance_opt.jobs.bake",
     "bake_options": "appearance_opt.config",
     "compare": "appearance_opt.jobs.compare",
+    "convert": "appearance_opt.jobs.convert",
+    "convert_options": "appearance_opt.config",
     "fit": "appearance_opt.jobs.fit",
     "inspect": "appearance_opt.jobs.inspect",
     "joint": "appearance_opt.jobs.joint",
@@ -104,6 +110,7 @@ __all__ = [
     "BakingOptions",
     "CompareOptions",
     "Comparison",
+    "ConvertOptions",
     "DisplacementOptions",
     "DivergedError",
     "FittingOptions",
@@ -125,6 +132,8 @@ __all__ = [
     "bake",
     "bake_options",
     "compare",
+    "convert",
+    "convert_options",
     "fit",
     "inspect",
     "joint",

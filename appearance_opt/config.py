@@ -19,6 +19,7 @@ from appearance_opt.options.jobs import (
     BakeOptions,
     CommonOptions,
     CompareOptions,
+    ConvertOptions,
     InspectOptions,
     JointOptions,
     SimplifyOptions,
@@ -32,12 +33,14 @@ __all__ = [
     "BakeOptions",
     "CommonOptions",
     "CompareOptions",
+    "ConvertOptions",
     "InspectOptions",
     "JointOptions",
     "SimplifyOptions",
     "animate_options",
     "as_dict",
     "bake_options",
+    "convert_options",
     "flat_keys",
     "joint_options",
     "make_options",
@@ -65,6 +68,11 @@ def animate_options(preset: str = "default", **values: Any) -> AnimateOptions:
 def bake_options(preset: str = "default", **values: Any) -> BakeOptions:
     """The same for a bake."""
     return make_options(BakeOptions, preset, values)
+
+
+def convert_options(preset: str = "default", **values: Any) -> ConvertOptions:
+    """The same for a conversion."""
+    return make_options(ConvertOptions, preset, values)
 
 
 def joint_options(preset: str = "default", **values: Any) -> JointOptions:

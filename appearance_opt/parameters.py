@@ -24,10 +24,15 @@ INPUTS = {
     "INPUT": ".glb .gltf .usd* .obj .ply .stl",
     "HIGH": "What it shall look like.",
     "LOW": "Keeps its topology and its texture coordinates.",
+    "KIND": "What SOURCE is: sdf.",
+    "SOURCE": "What it shall look like.",
     "REFERENCE": "What it shall look like.",
     "CANDIDATE": "What is judged.",
 }
 """Help of positional arguments."""
+
+WORDS = ("KIND", "SOURCE")
+"""Those that are no paths, though a path may be in them."""
 
 
 class Command(TyperCommand):
@@ -65,7 +70,7 @@ class Given:
     keys."""
 
     kind: str
-    inputs: tuple[Path, ...]
+    inputs: tuple[Path | str, ...]
     values: dict[str, Any]
 
     def spec(
@@ -110,8 +115,9 @@ def add_command(app: typer.Typer, kind: str, function: Callable[..., None]) -> N
 
 def _argument(name: str) -> inspect.Parameter:
     info = typer.Argument(metavar=name, help=INPUTS[name], show_default=False)
+    kind = str if name in WORDS else Path
     return inspect.Parameter(
-        name.lower(), inspect.Parameter.KEYWORD_ONLY, annotation=Annotated[Path, info]
+        name.lower(), inspect.Parameter.KEYWORD_ONLY, annotation=Annotated[kind, info]
     )
 
 

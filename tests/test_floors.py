@@ -12,7 +12,7 @@ ROOT = Path(appearance_opt.__file__).parent
 FLOORS = (
     ("errors", "memory", "digest", "asset", "lock", "publish"),
     ("views", "backend", "placement", "options", "config", "progress", "interrupts", "doctor"),
-    ("render",),
+    ("render", "sdf"),
     ("latent", "reference", "baking", "initial"),
     ("optimize",),
     ("stages",),

@@ -27,9 +27,9 @@ from appearance_opt.options.option import Record, entries, flag_name, option, pa
 from appearance_opt.options.reading import AssetOptions
 from appearance_opt.parameters import describe
 
-NEED_TRIANGLES = (JOBS["simplify"].options, JOBS["animate"].options)
+NEED_TRIANGLES = tuple(JOBS[kind].options for kind in ("simplify", "animate", "convert"))
 
-LEAST = {"simplify": {"triangles": 100}, "animate": {"triangles": 100}}
+LEAST = {kind: {"triangles": 100} for kind in ("simplify", "animate", "convert")}
 """What a job cannot do without."""
 
 RANGES = [

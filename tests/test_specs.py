@@ -20,7 +20,7 @@ INPUTS = ("a high.glb", 'b "low" \u00e4\\.usda')
 
 def spec(kind: str, preset: str = "draft", **values: object) -> JobSpec:
     job = JOBS[kind]
-    given = {"triangles": 9, **values} if kind in ("simplify", "animate") else values
+    given = {"triangles": 9, **values} if kind in ("simplify", "animate", "convert") else values
     return JobSpec(kind, INPUTS[: len(job.inputs)], "out.glb" if job.writes else None,
                    make_options(job.options, preset, given))  # fmt: skip
 

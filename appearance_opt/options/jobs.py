@@ -15,7 +15,7 @@ from appearance_opt.options.maps import DisplacementOptions, TextureOptions
 from appearance_opt.options.option import Record, option, part, require
 from appearance_opt.options.parts import PartOptions
 from appearance_opt.options.reading import AssetOptions
-from appearance_opt.options.start import StartOptions
+from appearance_opt.options.start import ConvertStartOptions, StartOptions
 from appearance_opt.options.views import ViewOptions
 
 DEVICES = ("auto", "cpu", "cuda")
@@ -100,6 +100,14 @@ class AnimateOptions(SimplifyOptions):
 
     displacement: DisplacementOptions = part(DisplacementOptions, only=())
     animation: AnimationOptions = part(AnimationOptions)
+
+
+@dataclass(frozen=True)
+class ConvertOptions(SimplifyOptions):
+    """How to convert what is no mesh: there are no triangles to take a ratio of, no parts."""
+
+    start: StartOptions = part(ConvertStartOptions, without=("ratio",))
+    parts: PartOptions = part(PartOptions, only=())
 
 
 @dataclass(frozen=True)
@@ -193,6 +201,12 @@ JOBS: dict[str, Job] = {
         "Write an animated character with fewer triangles, fitted over the frames of its clips.",
         AnimateOptions,
         ("INPUT",),
+    ),
+    "convert": Job(
+        "Write a textured mesh of what is none. KIND says what SOURCE is: sdf (a distance field: "
+        "FILE.py:NAME, whose code is run, or a grid in FILE.npz).",
+        ConvertOptions,
+        ("KIND", "SOURCE"),
     ),
     "compare": Job(
         "Measure how different two assets look: PSNR, FLIP, silhouettes.",

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar
 
 from appearance_opt.errors import InputError
 from appearance_opt.options.option import Record, check_choice, option
-
-INITS = ("decimate", "sphere")
 
 
 @dataclass(frozen=True)
 class StartOptions(Record):
     """``triangles`` or ``ratio``: the budget (exactly one; neither is needed where ``init`` is a
-    file)."""
+    file). ``INITS``: what ``init`` may be apart from a file."""
+
+    INITS: ClassVar[tuple[str, ...]] = ("decimate", "sphere")
 
     triangles: int | None = option(
         None, "At most this many triangles.", panel="Start", low=1, expected="at least 1"
@@ -35,13 +36,32 @@ class StartOptions(Record):
 
     def __post_init__(self) -> None:
         given = (self.triangles is not None) + (self.ratio is not None)
-        if given == 2 or (given == 0 and self.init in INITS):
+        if given == 2 or (given == 0 and self.init in self.INITS):
             raise InputError("give either --triangles N or --ratio R")
         super().__post_init__()
         if self.file is None:
-            check_choice("init", self.init, INITS)
+            check_choice("init", self.init, self.INITS)
 
     @property
     def file(self) -> str | None:
         """The file to start from, if ``init`` names one."""
-        return self.init if self.init not in INITS and Path(self.init).suffix else None
+        return self.init if self.init not in self.INITS and Path(self.init).suffix else None
+
+
+@dataclass(frozen=True)
+class ConvertStartOptions(StartOptions):
+    """The same for what is no mesh: its first shape is found, or fitted."""
+
+    INITS: ClassVar[tuple[str, ...]] = ("marching-cubes", "sphere")
+
+    init: str = option(
+        "marching-cubes",
+        "marching-cubes (of a shape that can be asked), sphere, or a file to start from.",
+        panel="Start",
+        metavar="marching-cubes|sphere|FILE",
+    )
+
+    def __post_init__(self) -> None:
+        if self.triangles is None and self.init in self.INITS:
+            raise InputError("give --triangles N")
+        super().__post_init__()

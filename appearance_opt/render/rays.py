@@ -63,6 +63,16 @@ def _in_pixels(
 ) -> tuple[Samples, mi.Bool]:
     """What each ray hits, and whether it hits: ``ray`` counts through ``count`` rays in every
     pixel."""
+    view, x, y = positions_in_pixels(batch, index, ray, count)
+    hits = trace(scene, batch, view, x, y)
+    return hits, hits.triangle != MISS
+
+
+def positions_in_pixels(
+    batch: Batch, index: mi.UInt32, ray: mi.UInt32, count: int
+) -> tuple[mi.UInt32, mi.Float, mi.Float]:
+    """(view, x, y) of rays: ``ray`` counts through ``count`` of them in every pixel at the
+    positions ``index`` of the grid."""
     k = ray // count
     at = dr.gather(mi.UInt32, index, k)
     odd = 2 * (ray - k * count) + 1  # as in ``sub_pixel_offsets``
@@ -72,5 +82,4 @@ def _in_pixels(
         mi.Float(dr.gather(mi.UInt32, batch.grid.row, at))
         + mi.Float(odd * lattice.generator(count) % (2 * count)) * scale
     )
-    hits = trace(scene, batch, dr.gather(mi.UInt32, batch.grid.view, at), x, y)
-    return hits, hits.triangle != MISS
+    return dr.gather(mi.UInt32, batch.grid.view, at), x, y

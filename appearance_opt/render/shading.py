@@ -17,6 +17,7 @@ from appearance_opt.render.math import at_least
 from appearance_opt.render.surface import interpolate
 
 if TYPE_CHECKING:
+    from appearance_opt.render.camera import Camera
     from appearance_opt.render.drawn import Shown
     from appearance_opt.render.pixels import Batch
     from appearance_opt.render.samples import Samples
@@ -35,9 +36,21 @@ def shade(shown: Shown, batch: Batch, samples: Samples, width: mi.Float) -> mi.C
     if sample.unlit is True:
         return sample.base_color
     normal = material.shading_normal(hit, sample)
-    to_light = camera.light - hit.position
+    lit = illuminate(sample, normal, hit.position, hit.to_viewer, camera)
+    return lit if sample.unlit is False else dr.select(sample.unlit, sample.base_color, lit)
+
+
+def illuminate(
+    sample: brdf.MaterialSample,
+    normal: mi.Vector3f,
+    position: mi.Point3f,
+    to_viewer: mi.Vector3f,
+    camera: Camera,
+) -> mi.Color3f:
+    """Return what surfaces reflect of the light of their view: unit ``normal`` that they are shaded
+    with, unit direction ``to_viewer``. Linear RGB."""
+    to_light = camera.light - position
     squared_distance = at_least(dr.squared_norm(to_light), NEAREST_LIGHT**2)
     to_light *= dr.rsqrt(squared_distance)
     irradiance = camera.intensity / squared_distance
-    lit = brdf.reflect(sample, normal, hit.to_viewer, to_light) * irradiance
-    return lit if sample.unlit is False else dr.select(sample.unlit, sample.base_color, lit)
+    return brdf.reflect(sample, normal, to_viewer, to_light) * irradiance
