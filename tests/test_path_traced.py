@@ -21,6 +21,7 @@ from appearance_opt.evaluate.environment import (
     radiance,
     render_environment,
 )
+from appearance_opt.reference.plugins import MINIMUM_LLVM
 from appearance_opt.views import Views, look_at, views_around
 from tests.conftest import make_asset
 
@@ -29,7 +30,7 @@ RESOLUTION = 48
 
 @pytest.fixture(autouse=True)
 def compiler(variant: str) -> None:
-    if variant == backend.CPU and dr.detail.llvm_version()[0] < path_traced.MINIMUM_LLVM:
+    if variant == backend.CPU and dr.detail.llvm_version()[0] < MINIMUM_LLVM:
         pytest.skip("Mitsuba's plugins need a newer LLVM")
 
 

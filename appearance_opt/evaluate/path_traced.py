@@ -17,9 +17,8 @@ import numpy as np
 from appearance_opt.asset.alpha import coverage, kind_of
 from appearance_opt.asset.batch import fill_normals
 from appearance_opt.asset.packing import resize
-from appearance_opt.backend import CPU, install_hint
-from appearance_opt.errors import BackendError
 from appearance_opt.evaluate.environment import panorama
+from appearance_opt.reference.plugins import check_compiler, sensor_of
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -29,9 +28,6 @@ if TYPE_CHECKING:
 
 DEPTH = 6
 """Vertices of a path: enough for light that is reflected four times."""
-
-MINIMUM_LLVM = 17
-"""Oldest LLVM that compiles Mitsuba's own plugins."""
 
 
 class PathTraced:
@@ -46,7 +42,7 @@ class PathTraced:
 
     def __init__(self, asset: Asset, environment: bool = False, depth: int = DEPTH) -> None:
         """Raises BackendError where Mitsuba's plugins do not run."""
-        _check_compiler()
+        check_compiler()
         self.environment = environment
         self.notes: tuple[str, ...] = ()
         scene: dict[str, Any] = {"type": "scene"}
@@ -94,44 +90,6 @@ class PathTraced:
             float(views.intensity[k])
         )
         params.update()
-
-
-def _check_compiler() -> None:
-    """Kernels of Mitsuba's plugins hold instructions that LLVM before 17 aborts the process on."""
-    import drjit as dr
-
-    found = dr.detail.llvm_version() if mi.variant() == CPU else (MINIMUM_LLVM,)
-    if found[0] < MINIMUM_LLVM:
-        raise BackendError(
-            f"the path tracer needs libLLVM {MINIMUM_LLVM} or newer, and finds {found[0]}: "
-            f"{install_hint()}"
-        )
-
-
-def sensor_of(views: Views, k: int, resolution: int) -> dict[str, Any]:
-    """Description of a Mitsuba camera for view ``k``: colour and coverage, averaged over pixels."""
-    eye, forward = (a[k].astype(np.float64) for a in (views.eye, views.forward))
-    half = float(np.linalg.norm(views.right[k].astype(np.float64)))
-    up = [float(x) for x in -views.down[k]]
-    to_world = mi.ScalarTransform4f().look_at(
-        origin=[float(x) for x in eye], target=[float(x) for x in eye + forward], up=up
-    )
-    return {
-        "type": "perspective",
-        "fov": float(np.degrees(2 * np.arctan(half))),
-        "to_world": to_world,
-        "near_clip": 1e-3,
-        "far_clip": 1e4,
-        "sampler": {"type": "multijitter"},
-        "film": {
-            "type": "hdrfilm",
-            "width": resolution,
-            "height": resolution,
-            "pixel_format": "rgba",
-            "component_format": "float32",
-            "rfilter": {"type": "box"},
-        },
-    }
 
 
 def _environment() -> dict[str, Any]:
