@@ -19,6 +19,7 @@ from appearance_opt.baking.target_mesh import movable, prepare
 from appearance_opt.config import bake_options, joint_options, simplify_options
 from appearance_opt.errors import InputError
 from appearance_opt.initial.sphere import sphere
+from appearance_opt.jobs.compare import compare
 from appearance_opt.jobs.joint import joint
 from appearance_opt.jobs.result import SimplifyResult
 from appearance_opt.jobs.simplify import simplify
@@ -148,12 +149,22 @@ def test_files_of_a_displaced_result(bumpy: Asset, tmp_path: Path) -> None:
     result = simplify(bumpy, out, o, report=tmp_path / "report")
     assert {p.name for p in tmp_path.iterdir()} == {
         "low.glb",
-        "low_displacement.png",
+        "low_base.glb",
+        "low_base_displacement.png",
         "low_level1.glb",
         "low_level2.glb",
         "report",
     }
-    base, levels = load(out), {k: load(tmp_path / f"low_level{k}.glb") for k in (1, 2)}
+    # what a viewer opens looks right as it is
+    assert load(out).triangle_count == load(tmp_path / "low_level2.glb").triangle_count
+    assert any("low_base.glb is its base mesh" in note for note in result.notes)
+    base = load(tmp_path / "low_base.glb")
+    psnr = [
+        compare(bumpy, asset, views=2, resolution=64, samples=4).metrics.psnr_covered
+        for asset in (load(out), result.shown, base)
+    ]
+    assert abs(psnr[0] - psnr[1]) < 0.2 and psnr[0] > psnr[2] + 1
+    levels = {k: load(tmp_path / f"low_level{k}.glb") for k in (1, 2)}
     assert base.triangle_count == result.triangles <= 200
     for level, asset in levels.items():
         assert asset.triangle_count == base.triangle_count * 4**level
@@ -164,7 +175,7 @@ def test_files_of_a_displaced_result(bumpy: Asset, tmp_path: Path) -> None:
     # who has the base mesh and the 16-bit map alone gets the same mesh
     given = result.asset.meshes[0].material.displacement
     assert given is not None
-    pixels = _png(tmp_path / "low_displacement.png")
+    pixels = _png(tmp_path / "low_base_displacement.png")
     heights = heights_of(Displacement(Texture(pixels, "linear"), given.scale, given.mid))
     mesh = movable(prepare(base).mesh)
     codec = TexelCodec((DISPLACEMENT,), len(heights))

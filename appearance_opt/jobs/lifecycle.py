@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from appearance_opt import backend
 from appearance_opt.asset import load, write
 from appearance_opt.interrupts import Interrupts
-from appearance_opt.jobs.paths import level_path
+from appearance_opt.jobs.paths import base_path, holds_displacement, level_path
 from appearance_opt.jobs.report import write_job_report
 from appearance_opt.publish import publication
 from appearance_opt.stages.displacement import require_memory
@@ -116,7 +116,8 @@ def close_run(
     if outputs.out is not None:
         run.begin("writing the result")
         with publication() as together:
-            write(result.asset, together.place(outputs.out), options.output.for_file(outputs.out))
+            written = result.asset if holds_displacement(outputs.out) else result.drawn
+            write(written, together.place(outputs.out), options.output.for_file(outputs.out))
             result.files = together.files(outputs.out)
             if beside is not None:
                 beside(outputs.out, together)
@@ -141,10 +142,18 @@ def close_run(
 def write_levels(
     result: SimplifyResult, options: CommonOptions, out: Path, together: Publication
 ) -> None:
-    """What belongs beside a fitted mesh: its displacement map where the format has no place for
-    it, and tessellated meshes, where they are asked for."""
-    if options.displacement.fitted:
-        write_companion(result.asset, together.place(out))
+    """What belongs beside a fitted mesh: the base mesh and its displacement map where the format
+    has no place for one, and tessellated meshes, where they are asked for."""
+    files = options.output.for_file(out)
+    if options.displacement.fitted and not holds_displacement(out):
+        base = base_path(out)
+        write(result.asset, together.place(base), files)
+        write_companion(result.asset, together.place(base))
+        count, drawn = result.asset.triangle_count, result.drawn.triangle_count
+        result.notes.append(
+            f"{out.name} is the displaced mesh of {drawn:,} triangles; {base.name} is its base mesh "
+            f"of {count:,}, with the displacement map beside it"
+        )
     if options.displacement.write_tessellated:
         for level, asset in result.tessellated.items():
-            write(asset, together.place(level_path(out, level)), options.output.for_file(out))
+            write(asset, together.place(level_path(out, level)), files)

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from appearance_opt.asset import check_folder, check_writable
+from appearance_opt.asset.file_options import USD
 from appearance_opt.asset.paths import MAX_NAME
 from appearance_opt.asset.texture_files import SUFFIXES
 from appearance_opt.errors import InputError
@@ -48,7 +49,8 @@ REPORT_BYTES = 20 << 20
 @dataclass(frozen=True)
 class Outputs:
     """All that a job writes. ``out``: the result, with what its writer puts beside it; ``levels``:
-    tessellation levels that are written beside it, too; ``report``, ``checkpoint``, ``loose`` (of
+    tessellation levels that are written beside it, too; ``finest``: that of a displaced mesh, None
+    without displacement; ``report``, ``checkpoint``, ``loose`` (of
     a bake's maps): folders."""
 
     out: Path | None = None
@@ -56,6 +58,7 @@ class Outputs:
     checkpoint: Path | None = None
     loose: Path | None = None
     levels: tuple[int, ...] = ()
+    finest: int | None = None
     output: OutputOptions = field(default_factory=OutputOptions)
 
     @classmethod
@@ -78,15 +81,24 @@ class Outputs:
         out, report, checkpoint, loose = (
             None if path is None else Path(path) for path in (out, report, checkpoint, loose)
         )
-        output = OutputOptions() if options is None else options.output
-        return cls(out, report, checkpoint, loose, levels, output)
+        if options is None:
+            return cls(out, report, checkpoint, loose, levels)
+        finest = max(options.levels()) if options.displacement.fitted else None
+        return cls(out, report, checkpoint, loose, levels, finest, options.output)
 
     @property
     def results(self) -> tuple[Path, ...]:
         """Files in the format of the result."""
+        return tuple(path for path, _ in self._results())
+
+    def _results(self) -> list[tuple[Path, int]]:
+        """(file in the format of the result, tessellation level of the mesh in it)."""
         if self.out is None:
-            return ()
-        return self.out, *(level_path(self.out, level) for level in self.levels)
+            return []
+        out = [(level_path(self.out, level), level) for level in self.levels]
+        if self.finest is None or holds_displacement(self.out):
+            return [(self.out, 0), *out]
+        return [(self.out, self.finest), (base_path(self.out), 0), *out]
 
     @property
     def folders(self) -> tuple[Path, ...]:
@@ -153,7 +165,7 @@ class Outputs:
         can be told."""
         texels = 0 if options is None else options.texture.size**2
         need: list[tuple[Path, int]] = [(Path(tempfile.gettempdir()), 3 * texels)]
-        for path, level in zip(self.results, (0, *self.levels), strict=False):
+        for path, level in self._results():
             size = BYTES_PER_TRIANGLE * triangles * 4**level + BYTES_PER_TEXEL * texels
             need.append((path.parent, size))
         if self.loose is not None:
@@ -195,6 +207,17 @@ class Outputs:
 def level_path(out: Path, level: int) -> Path:
     """Where the mesh of a tessellation level goes: ``<stem>_level<k><suffix>`` beside ``out``."""
     return out.with_name(f"{out.stem}_level{level}{out.suffix}")
+
+
+def base_path(out: Path) -> Path:
+    """Where the base mesh of a displaced result goes whose format has no place for a displacement
+    map: ``<stem>_base<suffix>`` beside ``out``."""
+    return out.with_name(f"{out.stem}_base{out.suffix}")
+
+
+def holds_displacement(out: Path) -> bool:
+    """Has the format of a file a place for a displacement map, which its readers heed?"""
+    return out.suffix.lower() in USD
 
 
 def _check_names(path: Path, names: list[str]) -> None:

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 class Result:
     """What a job did.
 
-    ``asset``: the result as it is written. ``columns``: by name, what a report shows beside the
+    ``asset``: the result, with a displacement map if there is one. ``columns``: by name, what a report shows beside the
     source, the start first and what came of it last. ``fit``: curve and counts, None without one.
     ``title`` of a report, ``facts`` that it lists by name, ``pictures`` (H, W, 3) that it shows
     beside those of the maps. ``notes``: what the user should know, a line each. ``seconds``:
@@ -72,6 +72,11 @@ class Result:
         }
 
     @property
+    def drawn(self) -> Asset:
+        """The result for formats that have no place for a displacement map."""
+        return self.asset
+
+    @property
     def shown(self) -> Asset:
         """What is to be looked at: with a displacement map, the finest tessellated mesh."""
         return list(self.columns.values())[-1]
@@ -92,6 +97,11 @@ class SimplifyResult(Result):
     source_triangles: int = field(kw_only=True)
     kept_triangles: int = 0
     tessellated: dict[int, Asset] = field(default_factory=dict)
+
+    @property
+    def drawn(self) -> Asset:
+        """See ``Result``: the finest tessellated mesh."""
+        return self.tessellated[max(self.tessellated)] if self.tessellated else self.asset
 
     @classmethod
     def of(
