@@ -12,7 +12,7 @@ from appearance_opt.baking.texel_points import TexelPoints, texel_coverage
 from appearance_opt.evaluate.metrics import compare_images
 from appearance_opt.initial.atlas import unwrap
 from appearance_opt.initial.decimate import decimate
-from appearance_opt.initial.fill import fill
+from appearance_opt.initial.fill import fill, nearest_charts
 from appearance_opt.initial.sphere import sphere
 from appearance_opt.initial.transfer import transfer
 from appearance_opt.initial.visibility import importance, pixel_counts
@@ -218,6 +218,24 @@ def test_texels_that_nobody_sees_are_filled_smoothly() -> None:
     assert noise.mean() > 0.03  # 0.1
     assert 0 < left.mean() < 0.2 * noise.mean()
     assert left.max() < 0.5 * noise.max()
+
+
+def test_texels_between_charts_keep_other_charts_out_of_mip_levels() -> None:
+    """They are as the nearest chart, so that each level is nearer to that chart's colour than with
+    a smooth blend."""
+    values, covered = np.zeros((32, 32, 1), np.float32), np.zeros((32, 32), bool)
+    covered[:, :11] = covered[:, 19:] = True
+    values[:, 19:] = 1.0
+    nearest = values[nearest_charts(covered)]
+    np.testing.assert_array_equal(nearest[..., 0], np.tile(np.arange(32) > 14, (32, 1)))
+    for size in (2, 4, 8):  # of a texel of the level, which lies on the left chart in part
+
+        def error(filled: np.ndarray, size: int = size) -> float:
+            level = filled.reshape(32 // size, size, 32 // size, size).mean(axis=(1, 3))
+            return float(level[:, 10 // size].max())
+
+        assert error(nearest) <= error(fill(values, covered)[..., :1])
+    assert error(nearest) < error(fill(values, covered)) - 0.03
 
 
 def test_fill_is_smooth_and_leaves_known_texels() -> None:

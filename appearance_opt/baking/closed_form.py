@@ -19,7 +19,7 @@ from appearance_opt.asset.packing import EMISSION
 from appearance_opt.baking.occlusion import exposed, openness
 from appearance_opt.baking.reach import automatic_reach
 from appearance_opt.baking.texel_points import Points, TexelPoints
-from appearance_opt.initial.fill import fill
+from appearance_opt.initial.fill import fill, nearest_charts
 from appearance_opt.render.lattice import sub_pixel_offsets
 from appearance_opt.render.passing import blocked
 from appearance_opt.render.surface import face_normal
@@ -107,6 +107,7 @@ def bake(survey: Survey, mesh: LatentMesh, settings: Settings) -> BakedMaps:
             )
     hidden &= ~found
     maps: dict[str, NDArray[np.float32]] = {}
+    nearest = nearest_charts(covered) if covered.any() else ...
     start = 0
     for field in settings.fields:
         channels = FIELDS[field]
@@ -115,7 +116,7 @@ def bake(survey: Survey, mesh: LatentMesh, settings: Settings) -> BakedMaps:
         if field in ("normal", "object-normal"):
             length = np.linalg.norm(own, axis=-1, keepdims=True)
             own = (own / np.maximum(length, 1e-6)).astype(np.float32)
-        filled = fill(own, found)
+        filled = fill(own, found)[nearest]
         maps.update({c: np.ascontiguousarray(filled[..., k]) for k, c in enumerate(channels)})
     return BakedMaps(maps, covered, covered & ~found & ~hidden, hidden, reach)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt
 
 
 def fill(values: NDArray[np.float32], known: NDArray[np.bool_]) -> NDArray[np.float32]:
@@ -21,6 +22,14 @@ def fill(values: NDArray[np.float32], known: NDArray[np.bool_]) -> NDArray[np.fl
         have = np.minimum(weight, 1.0)[..., None]
         current = total / np.maximum(weight, 1e-12)[..., None] * have + up * (1 - have)
     return np.where(known[..., None], values, current).astype(np.float32)
+
+
+def nearest_charts(covered: NDArray[np.bool_]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """(rows, columns) (H, W) of the texel in a chart that is nearest to each texel: texels between
+    charts that have its colour keep those of other charts out of coarse mip levels, where a texel
+    stands for many (docs/trials.md: texels). ``covered``: those in charts, at least one."""
+    rows, columns = distance_transform_edt(~covered, return_distances=False, return_indices=True)
+    return rows, columns
 
 
 def _half(total: NDArray, weight: NDArray) -> tuple[NDArray, NDArray]:
