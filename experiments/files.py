@@ -1,6 +1,6 @@
 """What codecs, quantisation and compression cost: bytes, and dB against the heavy asset.
 
-    python -m experiments.files [--assets relic,chess_king,spot] [--budget 19] [--triangles 4000]
+    python -m experiments.files [--assets relic,chess_king,spot] [--steps 200] [--triangles 4000]
     python -m experiments.files --table
 
 Each asset is simplified once; the result is written in every way, read back and compared (12 views,
@@ -49,7 +49,7 @@ def result_of(asset: str, settings: dict) -> Path:
     """The asset simplified, without loss in its file; made when it is first asked for."""
     import appearance_opt
 
-    out = OUT / f"{asset}_{settings['triangles']}_{settings['budget']:g}.glb"
+    out = OUT / f"{asset}_{settings['triangles']}_{settings['steps']}.glb"
     if not out.is_file():
         out.parent.mkdir(parents=True, exist_ok=True)
         values = appearance_opt.simplify_options("draft", **settings)
@@ -97,13 +97,13 @@ def table(rows: list[dict]) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--assets", default="relic,chess_king,spot")
-    parser.add_argument("--budget", type=float, default=19.0)
+    parser.add_argument("--steps", type=int, default=200)
     parser.add_argument("--triangles", type=int, default=4000)
     parser.add_argument("--table", action="store_true", help="only print what is there")
     args = parser.parse_args()
     kept = Kept(OUT / "results.json")
     if not args.table:
-        settings = {"budget": args.budget, "triangles": args.triangles}
+        settings = {"steps": args.steps, "triangles": args.triangles}
         for asset in args.assets.split(","):
             for way in (w for w in WAYS if options_of(w, OUT / "any.glb") is not None):
                 key = {"asset": asset, "way": way, **settings}

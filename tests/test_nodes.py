@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from appearance_opt.asset import FileOptions, hierarchy, load, save
 from appearance_opt.asset.types import Asset, Credits, Mesh, Node
+from appearance_opt.jobs.inspect import inspect
 from tests.conftest import grid_sphere
 from tests.test_written_files import document, painted, part
 from tests.validators import khronos_messages, usd_messages
@@ -250,3 +251,12 @@ def test_meshes_of_blender_and_of_flat_files_are_parts(tmp_path: Path) -> None:
     asset = load(tmp_path / "a.usda")
     assert [asset.nodes[m.node].name for m in asset.meshes] == ["Cube", "left", "right"]
     np.testing.assert_allclose(world(asset)["Cube"], placed((1, 3, -2)), atol=1e-9)
+
+
+def test_inspect_names_parts_and_owners(tmp_path: Path) -> None:
+    save(car(), tmp_path / "a.glb")
+    found = inspect(tmp_path / "a.glb")
+    assert found.parts == ("car", "door", "handle", "mirror")
+    lines = found.lines()
+    assert "copyright   (c) the author" in lines
+    assert "parts       4: car, door, handle, mirror" in lines

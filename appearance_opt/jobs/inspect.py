@@ -120,7 +120,8 @@ class Inspection:
     ``files`` that the asset is made of; ``single_sided``: triangles that are fitted and seen from
     one side, and ``backs_in_sight`` those among them whose backs may come into sight (see
     ``asset.sides``); ``texture_bytes``: of their pixels as they are stored here, uncompressed,
-    without mip levels; ``rig``: of what is animated, else None."""
+    without mip levels; ``rig``: of what is animated, else None; ``parts``: names of the nodes that
+    have meshes; ``copyright``: the line of its owners."""
 
     name: str
     files: int
@@ -139,6 +140,8 @@ class Inspection:
     alpha: dict[str, Share]
     notes: tuple[str, ...]
     rig: RigFacts | None = None
+    parts: tuple[str, ...] = ()
+    copyright: str = ""
 
     def record(self) -> dict[str, Any]:
         """All of it for JSON, the counts and contents among the rest."""
@@ -156,7 +159,10 @@ class Inspection:
             f"sides       {self.single_sided:,} triangles single-sided, {self.backs_in_sight:,} with backs in sight",
             f"textures    {self.textures}, {_bytes(self.texture_bytes)} uncompressed",
         ]
+        if self.copyright:
+            out += _wrap(f"{'copyright':12}", self.copyright)
         for what, names in (
+            ("parts", self.parts),
             ("skins", self.contents.skins),
             ("clips", self.contents.clips),
             ("morphs", self.contents.morph_targets),
@@ -230,6 +236,8 @@ def inspect(
         contents=asset.contents,
         alpha=count_kinds(parts),
         notes=parts.notes,
+        parts=_parts(asset),
+        copyright=asset.credits.copyright,
         rig=_rig(read) if asset.contents.skins or asset.contents.clips else None,
     )
 
@@ -253,6 +261,14 @@ def _rig(read: Callable[..., Asset]) -> RigFacts | None:
         rate=asset.rig.rate,
         animations=tuple(ClipFacts(c.name, c.duration, c.keys) for c in asset.rig.clips),
     )
+
+
+def _parts(asset: Asset) -> tuple[str, ...]:
+    """Names of the nodes that have meshes, as in the file."""
+    if not asset.nodes:
+        return ()
+    used = sorted({m.node for m in asset.meshes if m.node is not None})
+    return tuple(asset.nodes[k].name for k in used)
 
 
 def _textures(materials: Any) -> list[np.ndarray]:
