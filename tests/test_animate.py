@@ -164,8 +164,6 @@ def test_the_report_tells_the_error_by_frame(result: tuple[AnimateResult, Path])
     made, folder = result
     assert made.errors.frames == ("walk 0", "walk 8", "walk 16")
     assert all(len(e) == 3 for e in (made.errors.start, made.errors.wide, made.errors.pruned))
-    film = (folder / "report" / "film.gif").read_bytes()
-    assert film.startswith(b"GIF89a") and film.count(b"\x21\xf9\x04") == 3  # a picture per frame
     assert "worst frame" in (folder / "report" / "report.html").read_text(encoding="utf-8")
 
 

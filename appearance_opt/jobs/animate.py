@@ -13,33 +13,26 @@ import numpy as np
 from appearance_opt import backend
 from appearance_opt.asset.origin import ZERO
 from appearance_opt.asset.posing import pose_asset
-from appearance_opt.asset.types import Material
 from appearance_opt.config import AnimateOptions, resolve_options, with_values
 from appearance_opt.errors import InputError
-from appearance_opt.evaluate.comparison import render_asset
-from appearance_opt.evaluate.film import bone_colors, write_film
-from appearance_opt.evaluate.pictures import difference, picture
 from appearance_opt.jobs.lifecycle import close_run, load_source, name_of, open_run
 from appearance_opt.jobs.paths import Outputs
 from appearance_opt.jobs.result import SimplifyResult
 from appearance_opt.latent.build import latent_of
 from appearance_opt.latent.skinning import SkinWeights, prune
 from appearance_opt.optimize.validation import FrameValidation, Validation
-from appearance_opt.publish import publishing
 from appearance_opt.stages.animation import Animation
 from appearance_opt.stages.choice import choose_start
 from appearance_opt.stages.export import Exporter, export
 from appearance_opt.stages.fitting import POOL_SAMPLES, clean_maps, fit_latent, point_width
 from appearance_opt.stages.parts import split
-from appearance_opt.views import MEASURED, VALIDATION, look_at
+from appearance_opt.views import MEASURED, VALIDATION
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from numpy.typing import NDArray
-
     from appearance_opt.asset.rig import Skin
-    from appearance_opt.asset.types import Asset, Mesh
+    from appearance_opt.asset.types import Asset
     from appearance_opt.latent.latent import Latent
     from appearance_opt.optimize.loop import FitResult
     from appearance_opt.progress import Progress
@@ -52,13 +45,6 @@ LOOKED_AT, VIEWS_EACH = 6, 2
 
 MEASURED_FRAMES, MEASURED_VIEWS, MEASURED_RESOLUTION = 24, 4, 256
 """Frames whose error is told, and views of each that nothing was ever chosen by."""
-
-FILM, FILM_RATE, FILM_FRAMES, FILM_SIZE, FILM_SAMPLES = "film.gif", 12.0, 24, 192, 4
-"""Its name, pictures per second, at most so many, pixels per side of a column, and rays per
-pixel."""
-
-FILM_DISTANCE, FILM_ANGLE = 3.6, 33.0
-"""From where it is seen: radii of the asset, degrees."""
 
 WIDE_SHARE = 0.7
 """Part of the fit in which vertices choose among the bones of their support; the rest is fitted
@@ -138,16 +124,7 @@ def animate(
         animation = Animation.of(parts.fitted, options.animation, options.views)
         run.lap("reference")
         result, worst = _fit(animation, parts, options, run)
-        film = outputs.report is not None and options.animation.film
-        if film:
-            result.facts["film"] = FILM
         close_run(run, result, outputs, options, lambda: animation.at(worst))
-        if film:
-            assert outputs.report is not None
-            with publishing(outputs.report / FILM) as place:
-                write_film(place, _pictures(animation, result.asset), FILM_RATE)
-            run.lap("film")
-            result.seconds = {**run.watch.stages, "total": run.watch.total}
     return result
 
 
@@ -200,37 +177,6 @@ def _fit(
     result.notes = [*asset.notes, *start.notes, *result.notes]
     result.error = error
     return result, worst
-
-
-def _pictures(animation: Animation, asset: Asset) -> list[NDArray[np.uint8]]:
-    """Some frames from one side: source, result, their difference four times as bright, and the
-    weights of the result as colours of its bones."""
-    eye = np.array([[0.55, 0.4, 0.8]]) * FILM_DISTANCE / np.linalg.norm([0.55, 0.4, 0.8])
-    lamp = eye + np.array([[0.0, 1.5, 0.0]])
-    views = look_at(eye, np.zeros(3), FILM_ANGLE, lamp, 0.85 * np.pi * float(np.sum(lamp**2)))
-    tinted = replace(asset, meshes=tuple(_tinted(m, animation) for m in asset.meshes))
-    out = []
-    for k in _spread(len(animation.frames), FILM_FRAMES):
-        place, frame = animation.placements[k], animation.frames[k]
-        source = animation.reference.at(k).render(views, FILM_SIZE, FILM_SAMPLES)[0]
-        shown = [
-            render_asset(
-                place.local(pose_asset(a, frame.clip, frame.time)), views, FILM_SIZE, FILM_SAMPLES
-            )[0]
-            for a in (asset, tinted)
-        ]
-        row = [picture(source), picture(shown[0]), difference(source, shown[0]), picture(shown[1])]
-        out.append(np.concatenate(row, axis=1))
-    return out
-
-
-def _tinted(mesh: Mesh, animation: Animation) -> Mesh:
-    """A mesh in the colours of its bones, whatever the light."""
-    if mesh.skin is None:
-        return mesh
-    palette = bone_colors(len(animation.rig.bone_nodes))
-    colors = np.einsum("vk,vkc->vc", mesh.skin.weights, palette[mesh.skin.bones])
-    return replace(mesh, colors=colors.astype(np.float32), material=Material("weights", unlit=True))
 
 
 def _spread(count: int, most: int) -> list[int]:

@@ -12,7 +12,7 @@ from appearance_opt.options.option import Record, names_for, option
 class AnimationOptions(Record):
     """``clips``: those that are fitted (none named: all); ``frames``: START:STOP:STEP in each of
     them, at the rate of the file; ``influences``: bones per vertex of the result at the most, and
-    ``support``: of those among which the fit chooses. ``film``: draw one beside the report."""
+    ``support``: of those among which the fit chooses."""
 
     clips: tuple[str, ...] = option(
         (),
@@ -36,8 +36,6 @@ class AnimationOptions(Record):
     support: int = option(
         8, "Bones per vertex that the fit chooses from.", panel="Animation", low=1, high=32
     )
-
-    film: bool = option(True, "A film of the result beside the report.", panel="Animation")
 
     def __post_init__(self) -> None:
         super().__post_init__()
