@@ -17,6 +17,7 @@ from appearance_opt.render.math import clamp
 from appearance_opt.render.pixels import Batch, Grid, add_colors
 from appearance_opt.render.rays import positions_in_pixels
 from appearance_opt.render.shading import illuminate
+from appearance_opt.sdf.check import Tracing
 from appearance_opt.sdf.normals import normal
 from appearance_opt.sdf.trace import Hit, clip, sphere_trace
 
@@ -30,15 +31,6 @@ if TYPE_CHECKING:
 
 MAX_PIXELS = 1 << 20
 """Pixels rendered at once."""
-
-
-@dataclass(frozen=True)
-class Tracing:
-    """How a field is asked. ``safety``: what its distances are multiplied with; ``by_derivative``:
-    are its normals those of its derivative, or of differences?"""
-
-    safety: float = 1.0
-    by_derivative: bool = True
 
 
 @dataclass
@@ -92,8 +84,12 @@ class SdfReference:
 
     def trace(self, origin: mi.Point3f, way: mi.Vector3f) -> Hit:
         """What rays (unit directions) meet first."""
-        start, end = clip(self.field, origin, way)
+        start, end = self.clip(origin, way)
         return sphere_trace(self.field.distance, origin, way, start, end, self._safety)
+
+    def clip(self, origin: mi.Point3f, way: mi.Vector3f) -> tuple[mi.Float, mi.Float]:
+        """(start, end) of the part of rays that lies in the bounds."""
+        return clip(self.field, origin, way)
 
     def normal(self, p: mi.Point3f) -> mi.Vector3f:
         """Unit normals of the surface, outward."""

@@ -76,5 +76,9 @@ class Placed:
         color, roughness, metalness = Material(*self.field.material(self._world(p)))
         return Material(mi.Color3f(*color), mi.Float(roughness), mi.Float(metalness))
 
+    def to_world(self, points: NDArray) -> NDArray[np.float64]:
+        """(N, 3) points of the world."""
+        return np.asarray(points, np.float64) * self.scale + np.array(self.centre)
+
     def _world(self, p: mi.Point3f) -> mi.Point3f:
         return p * self.scale + mi.Point3f(*self.centre)
