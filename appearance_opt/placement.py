@@ -52,6 +52,12 @@ class Placement:
         intensity = (views.intensity * self.scale**2).astype(np.float32)
         return replace(views, eye=eye, light=light, intensity=intensity)
 
+    def views_to_local(self, views: Views) -> Views:
+        """The reverse."""
+        eye, light = (self.to_local(p).astype(np.float32) for p in (views.eye, views.light))
+        intensity = (views.intensity / self.scale**2).astype(np.float32)
+        return replace(views, eye=eye, light=light, intensity=intensity)
+
     def local(self, asset: Asset) -> Asset:
         """The asset in local coordinates; it has no origin of its own then."""
         relative = self.relative_to(asset.origin)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
@@ -101,6 +101,36 @@ def look_at(
     return Views(*(np.ascontiguousarray(a, np.float32) for a in arrays))
 
 
+class Sampler(Protocol):
+    """Where views come from: a pure function of (seed, stream, iteration), so that any iteration
+    can be replayed, and a resumed fit goes on with the same sequence.
+
+    ``centre``, ``radius``: of a sphere around the object; ``hull`` (N, 3): its extreme points, if
+    they are known; ``listed``: how many views there are, None where they are without number.
+    """
+
+    @property
+    def centre(self) -> tuple[float, float, float]: ...
+    @property
+    def radius(self) -> float: ...
+    @property
+    def seed(self) -> int: ...
+    @property
+    def stream(self) -> int: ...
+    @property
+    def hull(self) -> NDArray | None: ...
+    @property
+    def listed(self) -> int | None: ...
+
+    def held_out(self, stream: int) -> Sampler:
+        """The same kind of views, others: those of another of the streams above."""
+        ...
+
+    def draw(self, iteration: int, count: int) -> Views:
+        """``count`` views of this iteration."""
+        ...
+
+
 @dataclass(frozen=True)
 class ViewSampler:
     """Random cameras on a sphere around the object, each with one random point light.
@@ -111,8 +141,7 @@ class ViewSampler:
     anywhere), or it sits at the camera (``headlight``). Its intensity makes a white diffuse surface
     at the centre that faces it reflect ``exposure``.
 
-    Views are a pure function of (seed, stream, iteration): any iteration can be replayed, and a
-    resumed fit goes on with the same sequence.
+    See ``Sampler``.
     """
 
     centre: tuple[float, float, float]
@@ -124,6 +153,11 @@ class ViewSampler:
     light: str = "point"
     light_spread: float = 75.0
     exposure: float = 0.85
+
+    @property
+    def listed(self) -> None:
+        """They are without number."""
+        return None
 
     def held_out(self, stream: int) -> ViewSampler:
         """The same distribution, other draws: another of the streams above."""
@@ -152,6 +186,59 @@ class ViewSampler:
             spin,
         )
         return views if self.hull is None else frame(views, self.hull)
+
+
+HELD_OUT = 8
+"""Every so many views of a list, from the first one, are none that a fit sees."""
+
+
+@dataclass(frozen=True)
+class ListedViews:
+    """A ``Sampler`` of a finite list of ``views``, those of pictures that were taken.
+
+    Every ``HELD_OUT``-th view, from the first, is set aside: of these every other one judges the
+    states of a fit (``VALIDATION``), the rest is for reports (``MEASURED``); a lone one does both.
+    A fit sees the others in random order, each of them once before any is seen again. Draws begin
+    anew where a list ends.
+    """
+
+    views: Views
+    hull: NDArray
+    centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    radius: float = 1.0
+    seed: int = 0
+    stream: int = FIT
+
+    @property
+    def listed(self) -> int:
+        """See ``Sampler``."""
+        return len(self.numbers())
+
+    def numbers(self) -> NDArray[np.int64]:
+        """Which views of the list belong to this stream."""
+        every = np.arange(len(self.views))
+        aside = every[::HELD_OUT]
+        if self.stream == VALIDATION:
+            return aside[::2]
+        if self.stream == MEASURED:
+            return aside[1::2] if len(aside) > 1 else aside
+        return np.setdiff1d(every, aside)
+
+    def held_out(self, stream: int) -> ListedViews:
+        """See ``Sampler``."""
+        return replace(self, stream=stream)
+
+    def draw(self, iteration: int, count: int) -> Views:
+        """See ``Sampler``."""
+        numbers = self.numbers()
+        rounds, places = np.divmod(iteration * count + np.arange(count), len(numbers))
+        if self.stream in (VALIDATION, MEASURED):
+            return self.views[numbers[places]]
+        orders = {
+            int(r): np.random.default_rng([self.seed, self.stream, int(r)]).permutation(numbers)
+            for r in np.unique(rounds)
+        }
+        return self.views[[int(orders[int(r)][p]) for r, p in zip(rounds, places, strict=True)]]
 
 
 MARGIN = 1.02

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from appearance_opt.asset.types import Asset
     from appearance_opt.config import CompareOptions
     from appearance_opt.evaluate.metrics import Metrics
-    from appearance_opt.views import Views, ViewSampler
+    from appearance_opt.views import Sampler, Views
 
 
 @dataclass
@@ -52,7 +52,7 @@ class Comparison:
 
 
 def compare_local(
-    reference: Asset, candidate: Asset, sampler: ViewSampler, options: CompareOptions
+    reference: Asset, candidate: Asset, sampler: Sampler, options: CompareOptions
 ) -> Comparison:
     """Measure how different two assets look, which lie around the origin as the sampler asks.
     Raises InputError if one of the two shows nothing, BackendError if the path tracer does not

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from appearance_opt.evaluate.preview import Preview
     from appearance_opt.evaluate.verdict import AtSize
     from appearance_opt.reference.base import Reference
-    from appearance_opt.views import Views, ViewSampler
+    from appearance_opt.views import Sampler, Views
 
 LIGHTS = 16
 """Of the environment in which the pictures are taken: as many rays per pixel."""
@@ -68,7 +68,7 @@ def show(
     original: Asset | None,
     columns: dict[str, Asset],
     result: Asset,
-    sampler: ViewSampler,
+    sampler: Sampler,
     looks: Looks,
 ) -> Shown:
     """Look at a reference and at the ``columns`` of a report, the last of which is what came of it;
@@ -84,7 +84,13 @@ def show(
 
     assert sampler.hull is not None
     hero = picture_upright(
-        reference, original, columns[last], sampler.hull, looks.pictured, samples
+        reference,
+        original,
+        columns[last],
+        sampler.hull,
+        looks.pictured,
+        samples,
+        None if sampler.listed is None else views,
     )
     worst = int(np.argmax([v.flip for v in metrics[last].views]))
     random = {
@@ -121,10 +127,16 @@ def picture_upright(
     points: NDArray,
     size: int,
     samples: int = 9,
+    listed: Views | None = None,
 ) -> Upright:
     """Original, result and its wireframe from the side that shows most, ``size`` pixels wide.
-    ``points`` (N, 3): of the original; ``original``: what ``reference`` was made from, or None."""
-    view = hero_view(points, lambda v: reference.render(v, SMALL, 4))
+    ``points`` (N, 3): of the original; ``original``: what ``reference`` was made from, or None;
+    ``listed``: the only views that it can be seen in, if there are no others."""
+    if listed is None:
+        view = hero_view(points, lambda v: reference.render(v, SMALL, 4))
+    else:
+        shown = reference.render(listed, SMALL, 4)[..., 3].sum(axis=(1, 2))
+        view = listed[[int(shown.argmax())]]
     if original is None:
         first = check_images(reference.render(view, size, samples), 1, size, "the report")
         second, light = render_asset(final, view, size, samples), "a lamp"

@@ -15,7 +15,7 @@ from appearance_opt.initial.clustering import cluster
 from appearance_opt.initial.decimate import decimate_with_source
 from appearance_opt.initial.visibility import importance, pixel_counts
 from appearance_opt.render import upload
-from appearance_opt.views import VISIBILITY
+from appearance_opt.views import VISIBILITY, Sampler, ViewSampler
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from appearance_opt.latent.mesh import LatentMesh
     from appearance_opt.reference.survey import Triangles
     from appearance_opt.render.passing import Scene
-    from appearance_opt.views import ViewSampler
 
 VISIBILITY_VIEWS = 160
 
@@ -62,7 +61,7 @@ class Decimation:
         heavy: Triangles,
         triangles: int,
         budget: float | None,
-        sampler: ViewSampler | None,
+        sampler: Sampler | None,
         tell: Callable[[str], None],
     ) -> None:
         """``triangles`` that are asked for within a ``budget`` of seconds (None: no limit).
@@ -90,12 +89,13 @@ class Decimation:
             self.visible = seen if seen.sum() >= triangles else self.visible
 
     def _pixels(
-        self, heavy: Triangles, scene: Scene, count: int, sampler: ViewSampler
+        self, heavy: Triangles, scene: Scene, count: int, sampler: Sampler
     ) -> NDArray[np.int64]:
         """(F,) pixels in which each face was seen, at all poses."""
         if self.coarse or not heavy.poses:
             return pixel_counts(scene, count, sampler, VISIBILITY_VIEWS)
         each = max(VISIBILITY_VIEWS // len(heavy.poses), 8)
+        assert isinstance(sampler, ViewSampler)  # meshes are seen in random views
         free = replace(sampler, hull=None)  # which is that of the scene
         total = np.zeros(count, np.int64)
         for k, posed in enumerate(heavy.poses):

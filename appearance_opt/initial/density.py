@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
     from appearance_opt.latent.mesh import LatentMesh
     from appearance_opt.render.drawn import Drawn
-    from appearance_opt.views import ViewSampler
+    from appearance_opt.views import Sampler
 
 BATCHES, BATCH, RESOLUTION, SAMPLES = 4, 8, 256, 4
 """Views in which the loss is measured, and how."""
@@ -46,7 +46,7 @@ UNSEEN = 1e-3
 
 
 def chart_scales(
-    mesh: LatentMesh, maps: Mapping[str, NDArray | float], sampler: ViewSampler
+    mesh: LatentMesh, maps: Mapping[str, NDArray | float], sampler: Sampler
 ) -> NDArray[np.float64]:
     """(F,) how much longer and wider each face's chart should be than it is in the atlas of
     ``mesh``, relative to the others. ``maps``: (size, size), or a number, by channel name, in
@@ -63,7 +63,7 @@ def chart_scales(
 
 
 def _loss_of_half(
-    mesh: LatentMesh, maps: Mapping[str, NDArray | float], sampler: ViewSampler
+    mesh: LatentMesh, maps: Mapping[str, NDArray | float], sampler: Sampler
 ) -> NDArray[np.float64]:
     """(F,) squared display error that maps at half the resolution make, over the pixels that show
     each face."""

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from appearance_opt.latent.mesh import LatentMesh
     from appearance_opt.reference.base import Reference
     from appearance_opt.reference.survey import Triangles
-    from appearance_opt.views import ViewSampler
+    from appearance_opt.views import Sampler
 
 VIEWS, BATCH, RESOLUTION, SAMPLES = 64, 8, 256, 4
 """Views in which the error is measured, and how."""
@@ -57,7 +57,7 @@ class StartError:
         self,
         reference: Reference,
         triangles: Triangles,
-        sampler: ViewSampler,
+        sampler: Sampler,
         views: int = VIEWS,
     ) -> None:
         self.triangles = triangles

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from appearance_opt.render.passing import Scene
-    from appearance_opt.views import ViewSampler
+    from appearance_opt.views import Sampler
 
 MARGIN = 2
 """Rings of faces around the visible ones that count as visible, too: a face smaller than a pixel
@@ -31,7 +31,7 @@ HIDDEN, FLOOR = 1e-4, 0.05
 def pixel_counts(
     scene: Scene,
     faces: int,
-    sampler: ViewSampler,
+    sampler: Sampler,
     views: int,
     resolution: int = 256,
     batch: int = 8,

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from appearance_opt.asset.types import Asset, Mesh
     from appearance_opt.reference.base import Reference
-    from appearance_opt.views import ViewSampler
+    from appearance_opt.views import Sampler
 
 KEPT_TRIANGLES = 2_000_000
 """Triangles of posed meshes that are kept on the device, with their BVHs; at least one mesh is."""
@@ -67,7 +67,7 @@ class FramePool(ReferencePool):
     draws them, ``samplers``: views of each."""
 
     animated: AnimatedReference = field(kw_only=True)
-    samplers: tuple[ViewSampler, ...] = field(kw_only=True)
+    samplers: tuple[Sampler, ...] = field(kw_only=True)
 
     def _chosen(self, rng: np.random.Generator, oldest: int, newest: int) -> NDArray[np.int64]:
         group = int(rng.integers(oldest, newest + 1))
@@ -78,6 +78,6 @@ class FramePool(ReferencePool):
         rng = np.random.default_rng([self.sampler.seed, self.sampler.stream, round_, 2])
         return int(rng.permutation(len(self.samplers))[place])
 
-    def _source(self, group: int) -> tuple[Reference, ViewSampler]:
+    def _source(self, group: int) -> tuple[Reference, Sampler]:
         frame = self._frame_of(group)
         return self.animated.at(frame), self.samplers[frame]

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from appearance_opt.reference.base import Reference
-    from appearance_opt.views import ViewSampler
+    from appearance_opt.views import Sampler
 
 
 FIRST = 8
@@ -54,7 +54,7 @@ class ReferencePool:
     """
 
     reference: Reference
-    sampler: ViewSampler
+    sampler: Sampler
     capacity: int
     batch: int
     resolution: int
@@ -96,7 +96,7 @@ class ReferencePool:
         """The frame that a batch shows."""
         return None
 
-    def _source(self, group: int) -> tuple[Reference, ViewSampler]:
+    def _source(self, group: int) -> tuple[Reference, Sampler]:
         """What draws a batch, and its views."""
         return self.reference, self.sampler
 

@@ -19,7 +19,7 @@ from appearance_opt.placement import Placement
 from appearance_opt.reference.animated import AnimatedReference, FramePool
 from appearance_opt.reference.subject import Subject
 from appearance_opt.reference.survey import MeshSurvey
-from appearance_opt.views import ViewSampler, views_around
+from appearance_opt.views import Sampler, views_around
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -65,7 +65,7 @@ class Animation:
     matrices: NDArray[np.float64]
     subject: Subject
     reference: AnimatedReference
-    samplers: tuple[ViewSampler, ...]
+    samplers: tuple[Sampler, ...]
 
     @classmethod
     def of(cls, asset: Asset, options: AnimationOptions, views: ViewOptions) -> Animation:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING, TypeVar
 
 from appearance_opt.config import SimplifyOptions, with_values
@@ -44,6 +45,10 @@ def choose_start(
     elif o.start.init == "sphere" and alone:
         count = budget(o, available)
         start, o = _fit_shape(lambda effort: grow_start(subject, options, count, effort), o, run)
+    elif o.start.init == "hull":
+        count = budget(o, available)
+        grow = partial(grow_start, subject, options, count, hull=True)
+        start, o = _fit_shape(grow, o, run)
     elif o.start.init == "sphere":
         count = budget(o, available)
         start = _make(lambda: sphere_start(subject, options, count), run)

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from appearance_opt.reference.subject import Subject
     from appearance_opt.stages.run import Run
     from appearance_opt.stages.start import Start
+    from appearance_opt.views import Sampler
 
 log = logging.getLogger(__name__)
 
@@ -64,7 +65,7 @@ def fit_start(
     pool = ReferencePool(
         reference,
         sampler,
-        o.views.pool,
+        pool_size(sampler, o.views.pool, o.views.per_step),
         o.views.per_step,
         o.views.resolution,
         POOL_SAMPLES,
@@ -130,6 +131,12 @@ def fit_latent(
         error, fitted = diverged, FitResult()
     run.lap("fit")
     return fitted, error
+
+
+def pool_size(sampler: Sampler, wanted: int, batch: int) -> int:
+    """Views that a pool keeps at a time: no more than there are, but for a full last batch."""
+    listed = sampler.listed
+    return wanted if listed is None else min(wanted, -(-listed // batch) * batch)
 
 
 def point_width(resolution: int, texture_size: int) -> float:

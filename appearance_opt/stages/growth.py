@@ -34,7 +34,8 @@ from appearance_opt.reference.mesh import MeshReference
 from appearance_opt.reference.pool import ReferencePool
 from appearance_opt.reference.survey import MeshSurvey
 from appearance_opt.stages.displacement import flat_map
-from appearance_opt.stages.fitting import VALIDATION_VIEWS, clean_maps
+from appearance_opt.stages.fitting import VALIDATION_VIEWS, clean_maps, pool_size
+from appearance_opt.stages.hull import hull_mesh
 from appearance_opt.stages.run import Run
 from appearance_opt.stages.start import (
     Start,
@@ -52,7 +53,7 @@ if TYPE_CHECKING:
 
     from appearance_opt.config import SimplifyOptions
     from appearance_opt.reference.subject import Subject
-    from appearance_opt.views import ViewSampler
+    from appearance_opt.views import Sampler
 
 log = logging.getLogger(__name__)
 
@@ -121,12 +122,18 @@ def grow_start(
     options: SimplifyOptions,
     triangles: int,
     effort: Effort,
+    hull: bool = False,
 ) -> tuple[Start, bool]:
-    """(start, interrupted), grown from a sphere. Only images of the reference are used."""
+    """(start, interrupted), grown from a sphere, or from the ``hull`` that silhouettes leave. Only
+    images of the reference are used."""
     texture = min(TEXTURE, options.texture.size)
-    mesh = first_shape(triangles, subject.sampler, texture)
+    if hull:
+        mesh = hull_mesh(subject, OVERSAMPLING * triangles, texture)
+    else:
+        mesh = first_shape(triangles, subject.sampler, texture)
     maps = unknown_maps(subject, options, texture)
-    model, result = _fit_shape(subject, options, mesh, maps, 1.0, effort)
+    pace = MENDING if hull else 1.0
+    model, result = _fit_shape(subject, options, mesh, maps, pace, effort)
     likeness = to_asset(
         mesh, model.host_positions(), clean_maps(model, np.zeros((texture, texture), bool)), "grown"
     )
@@ -181,7 +188,14 @@ def _fit_shape(
     if positions is not None:
         positions.precondition(strength, pace * rate)
     pool = ReferencePool(
-        reference, sampler, POOL, VIEWS, RESOLUTION, POOL_SAMPLES, POINT_WIDTH, options.views.reuse
+        reference,
+        sampler,
+        pool_size(sampler, POOL, VIEWS),
+        VIEWS,
+        RESOLUTION,
+        POOL_SAMPLES,
+        POINT_WIDTH,
+        options.views.reuse,
     )
     validation = Validation(
         reference, sampler.held_out(VALIDATION).draw(0, VALIDATION_VIEWS), RESOLUTION
@@ -211,12 +225,12 @@ def smoothing(triangles: int) -> tuple[float, float]:
     return strength, POSITION_RATE * strength**0.5
 
 
-def first_shape(triangles: int, sampler: ViewSampler, texture: int) -> LatentMesh:
+def first_shape(triangles: int, sampler: Sampler, texture: int) -> LatentMesh:
     """What grows into a mesh of ``triangles``."""
     return stretch(sphere(OVERSAMPLING * triangles, (0.0, 0.0, 0.0), 1.0, texture), sampler)
 
 
-def stretch(ball: LatentMesh, sampler: ViewSampler) -> LatentMesh:
+def stretch(ball: LatentMesh, sampler: Sampler) -> LatentMesh:
     """The unit sphere around the origin as an ellipsoid that nearly fills the box that views are
     framed to (a sphere of ``ROUND`` of the sampler's radius where they are not framed). A round one
     leaves the ends of a long object to a few vertices, which do not arrive there while the steps

@@ -16,7 +16,7 @@ from appearance_opt.errors import InputError
 from appearance_opt.placement import Placement
 from appearance_opt.reference.subject import Subject
 from appearance_opt.stages.start import localize, require_survey
-from appearance_opt.views import views_around
+from appearance_opt.views import ViewSampler, views_around
 
 if TYPE_CHECKING:
     from appearance_opt.asset.types import Asset
@@ -105,6 +105,7 @@ class Pair:
         low, sampler = self.low_parts.whole, self.subject.sampler
         if not any(map(seen_through, (*self.high.meshes, *low.meshes))):
             return self.subject
+        assert isinstance(sampler, ViewSampler)  # meshes are seen in random views
         points = np.concatenate([self.high.points(), low.points()])
         placement = Placement.around(points)
         framed = views_around(placement.to_local(points), sampler.seed, sampler.light)

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from appearance_opt.reference.base import Reference
     from appearance_opt.reference.subject import Subject
     from appearance_opt.stages.start import Start
-    from appearance_opt.views import ViewSampler
+    from appearance_opt.views import Sampler
 
 Maps = dict[str, "NDArray[np.float32] | float"]
 
@@ -163,7 +163,7 @@ class Pictures:
     """A ``Judge`` that draws a model, which has fitted maps, in views that its fit has not seen."""
 
     def __init__(
-        self, model: Latent, reference: Reference, sampler: ViewSampler, resolution: int
+        self, model: Latent, reference: Reference, sampler: Sampler, resolution: int
     ) -> None:
         texels = model.fitted(Texels)
         assert texels is not None
