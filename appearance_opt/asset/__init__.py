@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -132,14 +133,25 @@ def save(asset: Asset, path: str | Path, options: FileOptions = PLAIN) -> None:
         write(asset, place, options)
 
 
-def write(asset: Asset, path: Path, options: FileOptions = PLAIN) -> None:
+HOLDS_LEVELS = tuple(suffix for suffix in WRITABLE if suffix != ".obj")
+"""Formats whose files can hold several levels of detail."""
+
+
+def write(
+    asset: Asset,
+    path: Path,
+    options: FileOptions = PLAIN,
+    coarser: Sequence[Asset] = (),
+    coverage: Sequence[float] = (),
+) -> None:
     """Write an asset's files where they are to be, one after the other: for places of a
-    publication. Raises OSError."""
+    publication. ``coarser``, ``coverage``: see ``save_gltf``; formats that cannot hold levels
+    (see ``HOLDS_LEVELS``) leave them out. Raises OSError."""
     suffix = path.suffix.lower()
     if suffix in (".glb", ".gltf"):
         from appearance_opt.asset.gltf_write import save_gltf
 
-        save_gltf(asset, path, options)
+        save_gltf(asset, path, options, coarser, coverage)
     elif suffix == ".obj":
         from appearance_opt.asset.obj_write import save_obj
 
@@ -147,7 +159,7 @@ def write(asset: Asset, path: Path, options: FileOptions = PLAIN) -> None:
     else:
         from appearance_opt.asset.usd_write import save_usd
 
-        save_usd(asset, path, options)
+        save_usd(asset, path, options, coarser)
 
 
 def check_writable(path: Path) -> None:

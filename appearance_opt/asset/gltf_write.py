@@ -32,6 +32,8 @@ from appearance_opt.asset.sides import apart_from_sides
 from appearance_opt.asset.texture_files import Slot, encode_all
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from appearance_opt.asset.file_options import FileOptions, MapKind
     from appearance_opt.asset.origin import Origin
     from appearance_opt.asset.types import Asset, ColorSpace, Displacement, Material, Mesh, Texture
@@ -41,15 +43,27 @@ _SOURCES = {"webp": WEBP, "ktx2": BASISU}
 """Extensions through which a texture names an image that is neither PNG nor JPEG."""
 
 
-def save_gltf(asset: Asset, path: Path, options: FileOptions = PLAIN) -> None:
+LOD, COVERAGE = "MSFT_lod", "MSFT_screencoverage"
+"""Extension of a node that coarser levels replace, and the key of its extras that says when."""
+
+
+def save_gltf(
+    asset: Asset,
+    path: Path,
+    options: FileOptions = PLAIN,
+    coarser: Sequence[Asset] = (),
+    coverage: Sequence[float] = (),
+) -> None:
     """Write .glb (one file) or .gltf (geometry in ``<stem>.bin``, textures in ``<stem>_<k>.png``,
-    or the suffix of their codec).
+    or the suffix of their codec). ``coarser``: levels that replace the asset where it is small
+    (MSFT_lod); ``coverage``: share of the screen down to which each level is shown, the asset's
+    first.
 
     glTF has no displacement: a height map goes to ``<stem>_displacement.png`` (16 bit), and the
     extras of its materials name it, its scale and its mid-level.
     """
     path = Path(path)
-    writer = _Writer(asset, path.stem, options)
+    writer = _Writer(asset, path.stem, options, coarser, coverage)
     for name, data in writer.companions.items():
         path.with_name(name).write_bytes(data)
     if path.suffix.lower() == ".glb":
@@ -69,7 +83,14 @@ def save_gltf(asset: Asset, path: Path, options: FileOptions = PLAIN) -> None:
 class _Writer:
     """Collects the JSON and the binary buffer of a file."""
 
-    def __init__(self, asset: Asset, stem: str, options: FileOptions) -> None:
+    def __init__(
+        self,
+        asset: Asset,
+        stem: str,
+        options: FileOptions,
+        coarser: Sequence[Asset] = (),
+        coverage: Sequence[float] = (),
+    ) -> None:
         self.buffers = Buffers(options)
         self.stem, self.options = stem, options
         self.companions: dict[str, bytes] = {}
@@ -81,7 +102,11 @@ class _Writer:
         self._looks: set[tuple] = set()
         self.json: dict[str, Any] = {"asset": _about(asset), "scene": 0, "meshes": []}
         if asset.rig is None:
-            self._place(asset)
+            self.json["nodes"] = []
+            tops = self._place(asset)
+            if coarser:
+                tops = [self._place_levels(asset.name, tops, coarser, coverage)]
+            self.json["scenes"] = [{"nodes": tops}]
         else:
             self._place_rigged(RigWriter(asset, asset.rig))
         self.images = encode_all(self._slots, options)
@@ -121,20 +146,19 @@ class _Writer:
             ]
         )
 
-    def _place(self, asset: Asset) -> None:
-        """Scene, nodes and meshes. Meshes of one node are one mesh in its coordinates. Those of no
-        node have one each, below a root that brings them to the asset's origin if that is not the
-        world's."""
+    def _place(self, asset: Asset) -> list[int]:
+        """Nodes and meshes; returns the nodes that none is above. Meshes of one node are one mesh
+        in its coordinates. Those of no node have one each, below a root that brings them to the
+        asset's origin if that is not the world's."""
         transforms, world = hierarchy.place_nodes(asset.nodes)
-        self.json["nodes"] = nodes = [
-            _node(n.name, t, n.extras) for n, t in zip(asset.nodes, transforms, strict=True)
-        ]
+        nodes: list[dict[str, Any]] = self.json["nodes"]
+        base = len(nodes)
+        nodes += [_node(n.name, t, n.extras) for n, t in zip(asset.nodes, transforms, strict=True)]
         tops: list[int] = []
         for k, node in enumerate(asset.nodes):
-            siblings = (
-                tops if node.parent is None else nodes[node.parent].setdefault("children", [])
-            )
-            siblings.append(k)
+            above = None if node.parent is None else nodes[base + node.parent]
+            siblings = tops if above is None else above.setdefault("children", [])
+            siblings.append(base + k)
         groups = hierarchy.group_by_node(asset)
         loose = [asset.meshes[k] for k in groups.pop(None, [])]
         for number, members in groups.items():
@@ -142,7 +166,7 @@ class _Writer:
             meshes, offset = hierarchy.in_coordinates(
                 [asset.meshes[k] for k in members], world[number], asset.origin
             )
-            self._hang(meshes, offset, nodes[number], nodes)
+            self._hang(meshes, offset, nodes[base + number], nodes)
         grid, first = self._grid(loose), len(nodes)
         nodes += [{"name": m.name, **self._shown([m], m.name, grid)} for m in loose]
         beside = list(range(first, len(nodes)))
@@ -150,7 +174,22 @@ class _Writer:
             root = {"name": asset.name, "translation": list(asset.origin), "children": beside}
             nodes.append(root)
             beside = [len(nodes) - 1]
-        self.json["scenes"] = [{"nodes": tops + beside}]
+        return tops + beside
+
+    def _place_levels(
+        self, name: str, tops: list[int], coarser: Sequence[Asset], coverage: Sequence[float]
+    ) -> int:
+        """A node for each level with all that it shows below it; those of coarser levels belong to
+        no scene. Returns the finest one, above ``tops``."""
+        below = [tops, *map(self._place, coarser)]
+        first = len(self.json["nodes"])
+        self.json["nodes"] += [
+            {"name": f"{name}_LOD{k}", "children": children} for k, children in enumerate(below)
+        ]
+        finest = self.json["nodes"][first]
+        self._extend(finest, LOD, {"ids": [first + k for k in range(1, len(below))]})
+        finest["extras"] = {COVERAGE: list(coverage)}
+        return first
 
     def _place_rigged(self, rig: RigWriter) -> None:
         """Scene, nodes, skins, animations and meshes of an asset that moves."""
@@ -294,7 +333,7 @@ class _Writer:
         self._extend(out, VOLUME, inside)
 
     def _extend(self, out: dict[str, Any], name: str, values: dict[str, Any]) -> None:
-        """Add an extension to a material, and to those that the file uses."""
+        """Add an extension to a material or a node, and to those that the file uses."""
         out.setdefault("extensions", {})[name] = values
         self._use(name)
 

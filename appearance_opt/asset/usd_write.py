@@ -24,6 +24,8 @@ from appearance_opt.asset.usd_nodes import COPYRIGHT, write_nodes
 from appearance_opt.asset.usd_rig_write import RigWriter
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from numpy.typing import NDArray
 
     from appearance_opt.asset.file_options import FileOptions
@@ -36,11 +38,18 @@ SIBLINGS = 500
 """Meshes that lie below one prim."""
 
 
-def save_usd(asset: Asset, path: Path, options: FileOptions = PLAIN) -> None:
+LOD = "LOD"
+"""Variant set of the levels of detail, whose variants are LOD0 (the finest), LOD1, ..."""
+
+
+def save_usd(
+    asset: Asset, path: Path, options: FileOptions = PLAIN, coarser: Sequence[Asset] = ()
+) -> None:
     """Write .usd, .usda or .usdc with PNG or JPEG files in ``<stem>_textures/``, or one .usdz package. Y
     up, metres. Vertex colours, times the base colour, are read by the surface where it has no
     texture of that; a UsdPreviewSurface cannot multiply the two. What light passes through becomes
-    opacity: of ``alpha.coverage``. Raises OSError when the disk refuses."""
+    opacity: of ``alpha.coverage``. With ``coarser`` levels, each is a variant of the default prim;
+    they share its materials. Raises OSError when the disk refuses."""
     from pxr import Sdf, Tf, UsdUtils
 
     path = Path(path)
@@ -48,7 +57,7 @@ def save_usd(asset: Asset, path: Path, options: FileOptions = PLAIN) -> None:
     folder = Path(tempfile.mkdtemp(dir=path.parent)) if package else path.parent
     try:
         root = folder / (path.stem + (".usdc" if package else path.suffix))
-        _write_stage(asset, root, f"{path.stem}_textures", options)
+        _write_stage((asset, *coarser), root, f"{path.stem}_textures", options)
         if package and not UsdUtils.CreateNewUsdzPackage(Sdf.AssetPath(str(root)), str(path)):
             raise OSError(errno.EIO, "the USDZ package could not be written", str(path))
     except Tf.ErrorException as error:  # USD has its own exceptions for what the system reports
@@ -59,9 +68,10 @@ def save_usd(asset: Asset, path: Path, options: FileOptions = PLAIN) -> None:
             shutil.rmtree(folder, ignore_errors=True)
 
 
-def _write_stage(asset: Asset, root: Path, textures: str, options: FileOptions) -> None:
-    from pxr import Gf, Kind, Tf, Usd, UsdGeom, UsdSkel
+def _write_stage(levels: Sequence[Asset], root: Path, textures: str, options: FileOptions) -> None:
+    from pxr import Kind, Tf, Usd, UsdGeom, UsdSkel
 
+    asset = levels[0]
     stage = Usd.Stage.CreateNew(str(root))
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
@@ -74,36 +84,72 @@ def _write_stage(asset: Asset, root: Path, textures: str, options: FileOptions) 
     Usd.ModelAPI(top.GetPrim()).SetKind(Kind.Tokens.component)
     if asset.credits.copyright:
         stage.GetRootLayer().customLayerData = {COPYRIGHT: asset.credits.copyright}
-    paths, world = write_nodes(stage, f"/{name}", asset)
+    UsdGeom.Scope.Define(stage, f"/{name}/Materials")
+    materials = _Materials(stage, f"/{name}/Materials", root.parent / textures, options)
+    for level in levels:  # outside of the variants, so that all of them share one texture set
+        for mesh in level.meshes:
+            materials.of(mesh)
+    if len(levels) == 1:
+        _fill(stage, top, asset, materials)
+    else:
+        variants = top.GetPrim().GetVariantSets().AddVariantSet(LOD)
+        for k, level in enumerate(levels):
+            variants.AddVariant(f"{LOD}{k}")
+            variants.SetVariantSelection(f"{LOD}{k}")
+            with variants.GetVariantEditContext():
+                _fill(stage, top, level, materials)
+        variants.SetVariantSelection(f"{LOD}0")
+    stage.GetRootLayer().Save()
+
+
+def _fill(stage: Any, top: Any, asset: Asset, materials: _Materials) -> None:
+    """Nodes and meshes of an asset below the prim ``top``."""
+    from pxr import Gf, Tf, UsdGeom
+
+    name = str(top.GetPath())
+    hung = asset.rig is None and all(m.node is not None for m in asset.meshes)
+    paths, world = write_nodes(stage, name, asset)
     if any(asset.origin) and not paths:
         top.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Vec3d(*asset.origin))
-    UsdGeom.Scope.Define(stage, f"/{name}/Materials")
-    rig = None if asset.rig is None else RigWriter(stage, f"/{name}", asset, asset.rig)
-    loose = f"/{name}"
+    rig = None if asset.rig is None else RigWriter(stage, name, asset, asset.rig)
+    loose = name
     if paths and any(asset.origin) and not hung:
-        loose = f"/{name}/Beside"
+        loose = f"{name}/Beside"
         beside = UsdGeom.Xform.Define(stage, loose)
         beside.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Vec3d(*asset.origin))
-    materials: dict[tuple[tuple, bool, bool], Any] = {}
     for k, mesh in enumerate(asset.meshes):
-        key = (apart_from_sides(mesh.material), _colored(mesh), _veiled(mesh))
-        if key not in materials:
-            word = Tf.MakeValidIdentifier(mesh.material.name)[:MAX_NAME]
-            target = f"/{name}/Materials/M{len(materials)}_{word}"
-            preview = _Preview(stage, target, root.parent / textures, options)
-            materials[key] = _material(preview, mesh.material, key[1], key[2])
         if mesh.node is not None and paths:
             parent = paths[mesh.node]
-            (mesh,), offset = in_coordinates([mesh], world[mesh.node], asset.origin)
+            (shown,), offset = in_coordinates([mesh], world[mesh.node], asset.origin)
         else:
-            offset = ZERO
+            shown, offset = mesh, ZERO
             parent = _parent(stage, loose, k, len(asset.meshes))
         target = f"{parent}/G{k}_{Tf.MakeValidIdentifier(mesh.name)}"
-        _mesh(stage, target, mesh, materials[key], rig)
+        _mesh(stage, target, shown, materials.of(mesh), rig)
         if any(offset):
             shape = UsdGeom.Xformable.Get(stage, target)
             shape.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Vec3d(*offset))
-    stage.GetRootLayer().Save()
+
+
+class _Materials:
+    """The materials of a stage below the prim ``scope``, each written when it is first asked for;
+    their textures go to ``folder``."""
+
+    def __init__(self, stage: Any, scope: str, folder: Path, options: FileOptions) -> None:
+        self._stage, self._scope, self._folder, self._options = stage, scope, folder, options
+        self._written: dict[tuple[tuple, bool, bool], Any] = {}
+
+    def of(self, mesh: Mesh) -> Any:
+        """What a mesh is bound to."""
+        from pxr import Tf
+
+        key = (apart_from_sides(mesh.material), _colored(mesh), _veiled(mesh))
+        if key not in self._written:
+            word = Tf.MakeValidIdentifier(mesh.material.name)[:MAX_NAME]
+            target = f"{self._scope}/M{len(self._written)}_{word}"
+            preview = _Preview(self._stage, target, self._folder, self._options)
+            self._written[key] = _material(preview, mesh.material, key[1], key[2])
+        return self._written[key]
 
 
 def _parent(stage: Any, top: str, number: int, count: int) -> str:
