@@ -13,11 +13,13 @@ if TYPE_CHECKING:
         ConvertOptions,
         InspectOptions,
         JointOptions,
+        LodOptions,
         SimplifyOptions,
         animate_options,
         bake_options,
         convert_options,
         joint_options,
+        lod_options,
         simplify_options,
     )
     from appearance_opt.errors import (
@@ -35,6 +37,7 @@ if TYPE_CHECKING:
     from appearance_opt.jobs.fit import fit
     from appearance_opt.jobs.inspect import Inspection, inspect
     from appearance_opt.jobs.joint import joint
+    from appearance_opt.jobs.lod import LodResult, lod
     from appearance_opt.jobs.result import BakeResult, Result, SimplifyResult
     from appearance_opt.jobs.simplify import simplify
     from appearance_opt.jobs.spec import JobSpec, run
@@ -71,6 +74,8 @@ _HOMES = {
     "Inspection": "appearance_opt.jobs.inspect",
     "JobSpec": "appearance_opt.jobs.spec",
     "JointOptions": "appearance_opt.config",
+    "LodOptions": "appearance_opt.config",
+    "LodResult": "appearance_opt.jobs.lod",
     "Reference": "appearance_opt.reference.base",
     "ReferenceRenderError": "appearance_opt.errors",
     "Result": "appearance_opt.jobs.result",
@@ -91,6 +96,8 @@ _HOMES = {
     "joint": "appearance_opt.jobs.joint",
     "joint_options": "appearance_opt.config",
     "load": "appearance_opt.asset",
+    "lod": "appearance_opt.jobs.lod",
+    "lod_options": "appearance_opt.config",
     "run": "appearance_opt.jobs.spec",
     "save": "appearance_opt.asset",
     "simplify": "appearance_opt.jobs.simplify",
@@ -119,6 +126,8 @@ __all__ = [
     "Inspection",
     "JobSpec",
     "JointOptions",
+    "LodOptions",
+    "LodResult",
     "Reference",
     "ReferenceRenderError",
     "Result",
@@ -139,6 +148,8 @@ __all__ = [
     "joint",
     "joint_options",
     "load",
+    "lod",
+    "lod_options",
     "run",
     "save",
     "simplify",

@@ -123,7 +123,7 @@ def simplify(
     config: Config = None,
     as_json: Json = False,
 ) -> None:
-    """Run the command of that name."""
+    """Run a job whose state can be kept: ``simplify`` or ``lod``."""
     spec = given.spec(out, config, frozenset({"triangles", "ratio"}))
     kept = {"checkpoint": checkpoint, "resume": resume}
     _run(spec, as_json, _folder(out, report, no_report), _files(config), **kept)
@@ -177,6 +177,7 @@ def inspect(given: Given, as_json: Json = False) -> None:
 
 COMMANDS: dict[str, Callable[..., None]] = {
     "simplify": simplify,
+    "lod": simplify,
     "bake": bake,
     "compare": compare,
     "inspect": inspect,

@@ -22,6 +22,7 @@ from appearance_opt.options.jobs import (
     ConvertOptions,
     InspectOptions,
     JointOptions,
+    LodOptions,
     SimplifyOptions,
 )
 from appearance_opt.options.option import Record, check_choice, entries, flag_name, spelling
@@ -36,6 +37,7 @@ __all__ = [
     "ConvertOptions",
     "InspectOptions",
     "JointOptions",
+    "LodOptions",
     "SimplifyOptions",
     "animate_options",
     "as_dict",
@@ -43,6 +45,7 @@ __all__ = [
     "convert_options",
     "flat_keys",
     "joint_options",
+    "lod_options",
     "make_options",
     "read_table",
     "read_toml",
@@ -63,6 +66,11 @@ def simplify_options(preset: str = "default", **values: Any) -> SimplifyOptions:
 def animate_options(preset: str = "default", **values: Any) -> AnimateOptions:
     """The same for an animated character."""
     return make_options(AnimateOptions, preset, values)
+
+
+def lod_options(preset: str = "default", **values: Any) -> LodOptions:
+    """The same for a chain of levels of detail."""
+    return make_options(LodOptions, preset, values)
 
 
 def bake_options(preset: str = "default", **values: Any) -> BakeOptions:

@@ -17,7 +17,18 @@ from appearance_opt.jobs.spec import JobSpec
 from appearance_opt.options.jobs import JOBS, PRESETS
 from appearance_opt.options.option import Entry, entries, flag_name
 
-PANELS = ("Input", "Start", "Animation", "Fit", "Displacement", "Baking", "Views", "Output", "Run")
+PANELS = (
+    "Input",
+    "Start",
+    "Levels",
+    "Animation",
+    "Fit",
+    "Displacement",
+    "Baking",
+    "Views",
+    "Output",
+    "Run",
+)
 """Headings of the help, in this order; others come after them."""
 
 INPUTS = {

@@ -20,6 +20,7 @@ import numpy as np
 from appearance_opt.asset.images import encode_png
 from appearance_opt.errors import one_line
 from appearance_opt.evaluate import three
+from appearance_opt.evaluate.chart import Chart, chart_svg
 from appearance_opt.evaluate.environment import panorama
 from appearance_opt.evaluate.metrics import Metrics
 from appearance_opt.evaluate.pictures import encode_for_page, shrink
@@ -53,10 +54,10 @@ class ReportData:
     ``metrics``: by column ("start", "result"); ``columns``: what these are, in a sentence each;
     ``views``: the pictures by name, among them "reference" and "result", perhaps "wireframe", all
     of one view of one size; ``captions``: of the views; ``maps``: pictures of the maps; ``curve``:
-    rows (seconds, step, PSNR, loss); ``facts``: what was asked and done; ``by_size``: how different
-    the two look at which size; ``sizes``: of "original" and "result"; ``previews``: the same in 3D;
-    ``links``: label and file, relative to the folder; ``options``: what was asked for; ``azimuth``,
-    ``elevation`` (degrees): from where the viewer looks first.
+    rows (seconds, step, PSNR, loss); ``charts``: more of them; ``facts``: what was asked and done;
+    ``by_size``: how different the two look at which size; ``sizes``: of "original" and "result";
+    ``previews``: the same in 3D; ``links``: label and file, relative to the folder; ``options``:
+    what was asked for; ``azimuth``, ``elevation`` (degrees): from where the viewer looks first.
     """
 
     title: str
@@ -65,6 +66,7 @@ class ReportData:
     views: list[dict[str, NDArray[np.uint8]]]
     maps: dict[str, NDArray[np.uint8]] = field(default_factory=dict)
     curve: list[tuple[float, int, float, float]] = field(default_factory=list)
+    charts: list[Chart] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     columns: dict[str, str] = field(default_factory=dict)
     captions: list[str] = field(default_factory=list)
@@ -115,6 +117,7 @@ def as_json(data: ReportData) -> dict[str, Any]:
         ],
         "notes": data.notes,
         "by_size": [asdict(a) for a in data.by_size],
+        "charts": [asdict(c) for c in data.charts],
         "sizes": {name: asdict(a) for name, a in data.sizes.items()},
     }
 
@@ -137,6 +140,7 @@ def page(data: ReportData) -> str:
         )
         if len(data.curve) > 1
         else "",
+        "charts": "".join(_section(c.title, c.lead, chart_svg(c)) for c in data.charts),
         "facts": _facts(data.facts, data.options),
         "notes": _notes(data.notes),
         "files": _links(data.links),

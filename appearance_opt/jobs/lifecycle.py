@@ -117,7 +117,8 @@ def close_run(
         run.begin("writing the result")
         with publication() as together:
             written = result.asset if holds_displacement(outputs.out) else result.drawn
-            write(written, together.place(outputs.out), options.output.for_file(outputs.out))
+            place, files = together.place(outputs.out), options.output.for_file(outputs.out)
+            result.write(written, place, files)
             result.files = together.files(outputs.out)
             if beside is not None:
                 beside(outputs.out, together)

@@ -50,7 +50,8 @@ REPORT_BYTES = 20 << 20
 class Outputs:
     """All that a job writes. ``out``: the result, with what its writer puts beside it; ``levels``:
     tessellation levels that are written beside it, too; ``finest``: that of a displaced mesh, None
-    without displacement; ``report``, ``checkpoint``, ``loose`` (of
+    without displacement; ``lods``: so many levels of detail that are files of their own, too;
+    ``report``, ``checkpoint``, ``loose`` (of
     a bake's maps): folders."""
 
     out: Path | None = None
@@ -59,6 +60,7 @@ class Outputs:
     loose: Path | None = None
     levels: tuple[int, ...] = ()
     finest: int | None = None
+    lods: int = 0
     output: OutputOptions = field(default_factory=OutputOptions)
 
     @classmethod
@@ -70,6 +72,7 @@ class Outputs:
         report: str | Path | None = None,
         checkpoint: str | Path | None = None,
         loose: str | Path | None = None,
+        lods: int = 0,
     ) -> Outputs:
         """From what a job was given. ``options``: how results are written, and are tessellated
         meshes, too?"""
@@ -82,9 +85,9 @@ class Outputs:
             None if path is None else Path(path) for path in (out, report, checkpoint, loose)
         )
         if options is None:
-            return cls(out, report, checkpoint, loose, levels)
+            return cls(out, report, checkpoint, loose, levels, lods=lods)
         finest = max(options.levels()) if options.displacement.fitted else None
-        return cls(out, report, checkpoint, loose, levels, finest, options.output)
+        return cls(out, report, checkpoint, loose, levels, finest, lods, options.output)
 
     @property
     def results(self) -> tuple[Path, ...]:
@@ -96,6 +99,7 @@ class Outputs:
         if self.out is None:
             return []
         out = [(level_path(self.out, level), level) for level in self.levels]
+        out += [(lod_path(self.out, k), 0) for k in range(self.lods)]
         if self.finest is None or holds_displacement(self.out):
             return [(self.out, 0), *out]
         return [(self.out, self.finest), (base_path(self.out), 0), *out]
@@ -218,6 +222,11 @@ def base_path(out: Path) -> Path:
 def holds_displacement(out: Path) -> bool:
     """Has the format of a file a place for a displacement map, which its readers heed?"""
     return out.suffix.lower() in USD
+
+
+def lod_path(out: Path, level: int) -> Path:
+    """Where a level of detail goes that is a file of its own: ``<stem>_lod<k><suffix>``."""
+    return out.with_name(f"{out.stem}_lod{level}{out.suffix}")
 
 
 def _check_names(path: Path, names: list[str]) -> None:

@@ -43,6 +43,7 @@ COLUMNS = {
     "fitted": "after the fit, as it is written",
     "result": "after the fit, as it is written",
     "level": "the displaced mesh at this level of tessellation",
+    "LOD": "a level of detail, seen as large as all others here",
 }
 """What the columns of numbers are, by the first word of their names or by all."""
 
@@ -71,6 +72,7 @@ def write_job_report(
         options=_options(options),
         maps={**pictures.texture_pictures(result.asset), **result.pictures},
         curve=[(p.seconds, p.step, p.psnr, p.loss) for p in curve],
+        charts=result.charts,
         notes=result.notes,
         columns={name: text for name, text in told.items() if text},
         sizes=sizes,

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
+from appearance_opt.asset import write
+
 if TYPE_CHECKING:
     from collections.abc import Iterable
     from pathlib import Path
@@ -12,8 +14,10 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from appearance_opt.asset.file_options import FileOptions
     from appearance_opt.asset.types import Asset
     from appearance_opt.errors import DivergedError
+    from appearance_opt.evaluate.chart import Chart
     from appearance_opt.optimize.loop import FitResult
     from appearance_opt.stages.export import Exported
     from appearance_opt.stages.parts import Parts
@@ -26,7 +30,7 @@ class Result:
     ``asset``: the result, with a displacement map if there is one. ``columns``: by name, what a report shows beside the
     source, the start first and what came of it last. ``fit``: curve and counts, None without one.
     ``title`` of a report, ``facts`` that it lists by name, ``pictures`` (H, W, 3) that it shows
-    beside those of the maps. ``notes``: what the user should know, a line each. ``seconds``:
+    beside those of the maps, ``charts`` that it draws. ``notes``: what the user should know, a line each. ``seconds``:
     wall-clock time by stage. ``files``: those that hold the asset, if it was written, the main one
     first. ``error``: set when the fit diverged (jobs raise it after the best
     state is written).
@@ -38,10 +42,16 @@ class Result:
     title: str = ""
     facts: dict[str, object] = field(default_factory=dict)
     pictures: dict[str, NDArray[np.uint8]] = field(default_factory=dict)
+    charts: list[Chart] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     seconds: dict[str, float] = field(default_factory=dict)
     files: tuple[Path, ...] = ()
     error: DivergedError | None = None
+
+    def write(self, asset: Asset, path: Path, options: FileOptions) -> None:
+        """Write the files of ``asset``, what its format can hold of the result, where they are to
+        be. Raises OSError."""
+        write(asset, path, options)
 
     @property
     def start(self) -> Asset:

@@ -9,6 +9,7 @@ from typing import Any
 from appearance_opt.errors import InputError
 from appearance_opt.options.animation import AnimationOptions
 from appearance_opt.options.baking import BakingOptions
+from appearance_opt.options.chain import ChainOptions
 from appearance_opt.options.files import OutputOptions
 from appearance_opt.options.fitting import FittingOptions
 from appearance_opt.options.maps import DisplacementOptions, TextureOptions
@@ -111,6 +112,16 @@ class ConvertOptions(SimplifyOptions):
 
 
 @dataclass(frozen=True)
+class LodOptions(SimplifyOptions):
+    """How to make a chain of levels; each is fitted at the size at which it is shown."""
+
+    start: StartOptions = part(StartOptions, only=("reallocate", "keep_hidden"), ratio=1.0)
+    views: ViewOptions = part(ViewOptions, without=("resolution",))
+    displacement: DisplacementOptions = part(DisplacementOptions, only=())
+    chain: ChainOptions = part(ChainOptions)
+
+
+@dataclass(frozen=True)
 class CompareOptions(Record):
     """How to compare two assets."""
 
@@ -207,6 +218,11 @@ JOBS: dict[str, Job] = {
         "FILE.py:NAME, whose code is run, or a grid in FILE.npz).",
         ConvertOptions,
         ("KIND", "SOURCE"),
+    ),
+    "lod": Job(
+        "Write a chain of levels of detail, each fitted for the size at which it is shown.",
+        LodOptions,
+        ("INPUT",),
     ),
     "compare": Job(
         "Measure how different two assets look: PSNR, FLIP, silhouettes.",
