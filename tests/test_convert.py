@@ -10,6 +10,7 @@ import pytest
 import appearance_opt as ao
 from appearance_opt import sdf
 from appearance_opt.jobs.convert import convert
+from appearance_opt.stages.unreached import describe, share_off
 from tests.test_cli import run
 
 QUICK = {"reallocate": 0, "texture_size": 64, "resolution": 48, "pool": 8, "views": 2, "steps": 4}
@@ -75,6 +76,18 @@ def test_a_shape_of_python_may_start_from_a_sphere() -> None:
     result = convert("sdf", ball, None, triangles=200, init="sphere", **QUICK)
     assert result.triangles <= 200 and result.fit.steps > 0
     assert result.title.startswith("Shape: ")
+
+
+def test_holes_that_a_sphere_does_not_get_to_are_told_of() -> None:
+    ring = sdf.Shape(lambda p: sdf.torus(p, 0.7, 0.25), ((-1, -0.3, -1), (1, 0.3, 1)))
+    notes = convert("sdf", ring, None, triangles=200, init="sphere", **QUICK).notes
+    assert any("of the silhouette are off" in n and "--init marching-cubes" in n for n in notes)
+    ball = np.hypot(*(np.mgrid[:64, :64] - 31.5)) < 20
+    assert share_off(ball[None], ball[None]) == 0.0
+    assert share_off(ball[None], np.roll(ball, 1, 0)[None]) == 0.0  # an outline a little off
+    holed = ball & (np.hypot(*(np.mgrid[:64, :64] - 31.5)) > 6)
+    assert 0.003 < share_off(ball[None], holed[None]) < 0.1
+    assert describe(0.0, True) == [] and "from a mesh" in describe(0.1, False)[0]
 
 
 @pytest.mark.parametrize(

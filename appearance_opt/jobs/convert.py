@@ -13,6 +13,8 @@ from appearance_opt.jobs.lifecycle import close_run, load_layout, open_run, writ
 from appearance_opt.jobs.paths import Outputs
 from appearance_opt.jobs.result import SimplifyResult
 from appearance_opt.options.option import check_choice
+from appearance_opt.reference.mesh import MeshReference
+from appearance_opt.stages import unreached
 from appearance_opt.stages.choice import choose_start
 from appearance_opt.stages.export import Exporter, export
 from appearance_opt.stages.fitting import fit_start
@@ -86,4 +88,9 @@ def _fit(opened: Opened, first: Asset | None, options: ConvertOptions, run: Run)
     run.lap("export")
     parts = Parts(exported.asset)
     notes += start.notes
+    if start.grown:
+        shown = MeshReference(subject.placement.local(exported.asset))
+        off = unreached.silhouettes_off(subject.reference, shown, subject.sampler)
+        notes += unreached.describe(off, subject.survey is not None)
+        run.lap("silhouettes")
     return SimplifyResult.of(exported, parts, fit, (opened.name, 0), notes, error)
