@@ -17,6 +17,7 @@ from appearance_opt.initial.sphere import sphere
 from appearance_opt.jobs.animate import AnimateResult, animate
 from appearance_opt.jobs.compare import compare
 from appearance_opt.latent.build import latent_of
+from appearance_opt.latent.latent import Latent
 from appearance_opt.latent.positions import POSITIONS
 from appearance_opt.latent.skinning import WEIGHTS, BoneFrames
 from appearance_opt.optimize.losses import LOSSES
@@ -58,19 +59,19 @@ def result(small: Asset, tmp_path_factory: pytest.TempPathFactory) -> tuple[Anim
     return made, folder
 
 
-def test_gradients_are_those_of_the_posed_mesh_through_the_bones() -> None:
-    """A posed latent against a still one at the same vertices, whose gradients, silhouettes
-    included, others compare with differences: by the chain rule, to rounding."""
+BONES = 3
+
+
+def posed_problem(matrices: np.ndarray) -> tuple[Latent, Latent, Grid, StepInputs]:
+    """(a latent at the second frame of ``matrices``, a still one at the same vertices, ...)."""
     rng = np.random.default_rng(0)
     mesh = sphere(200, (0.0, 0.0, 0.0), 0.6, 16)
-    count, bones = len(mesh.positions), 3
-    weights = rng.random((count, bones)).astype(np.float32)
+    count = len(mesh.positions)
+    weights = rng.random((count, BONES)).astype(np.float32)
     skin = Skin(
-        np.tile(np.arange(bones, dtype=np.int32), (count, 1)),
+        np.tile(np.arange(BONES, dtype=np.int32), (count, 1)),
         weights / weights.sum(axis=1, keepdims=True),
     )
-    matrices = np.tile(np.eye(4), (2, bones, 1, 1))
-    matrices[:, :, :3] += rng.normal(0, 0.15, (2, bones, 3, 4))
     maps = {"red": 0.6, "green": 0.3, "blue": 0.2, "roughness": 0.5, "metalness": 0.0}
     moving = latent_of(mesh, maps, ("shape",), skinned=(skin, BoneFrames.of(matrices)))
     moving.select(moving.poses[1])
@@ -79,25 +80,53 @@ def test_gradients_are_those_of_the_posed_mesh_through_the_bones() -> None:
     grid = Grid(2, 40)
     views = ViewSampler((0.0, 0.0, 0.0), 1.0, 4).draw(0, 2)
     target = mi.Float(rng.random(4 * grid.pixels).astype(np.float32) * 0.5)
-    inputs = StepInputs(views, Targets(target), np.full((2, 3), 0.4, np.float32), 0.0, 0.0, 3)
-    found, truth = (
-        Gradients(m, grid, Quality(), LOSSES["l2"], freeze=False)(inputs)[1]
-        for m in (moving, still)
-    )
-    by_vertex = np.array(truth[POSITIONS], np.float64).reshape(-1, 3)
+    background = np.full((2, 3), 0.4, np.float32)
+    return moving, still, grid, StepInputs(views, Targets(target), background, 0.0, 0.0, 3)
+
+
+def gradients(latent: Latent, grid: Grid, inputs: StepInputs) -> dict[str, np.ndarray]:
+    found = Gradients(latent, grid, Quality(), LOSSES["l2"], freeze=False)(inputs)[1]
+    return {name: np.array(g, np.float64) for name, g in found.items()}
+
+
+def test_gradients_are_those_of_the_posed_mesh_through_the_bones() -> None:
+    """A posed latent against a still one at the same vertices, whose gradients, silhouettes
+    included, others compare with differences: by the chain rule, to rounding."""
+    matrices = np.tile(np.eye(4), (2, BONES, 1, 1))
+    matrices[:, :, :3] += np.random.default_rng(1).normal(0, 0.15, (2, BONES, 3, 4))
+    moving, still, grid, inputs = posed_problem(matrices)
+    found, truth = gradients(moving, grid, inputs), gradients(still, grid, inputs)
+    mesh, m = moving.mesh, matrices[1]
+    by_vertex = truth[POSITIONS].reshape(-1, 3)
     assert np.abs(by_vertex).max() > 0
-    stored = moving.parameters[WEIGHTS].value
-    w = np.exp(np.array(stored, np.float64).reshape(count, bones))
+    w = np.exp(np.array(moving.parameters[WEIGHTS].value, np.float64).reshape(-1, BONES))
     w /= w.sum(axis=1, keepdims=True)
-    m = matrices[1]
     expected = np.einsum("vb,bij,vi->vj", w, m[:, :3, :3], by_vertex)
-    got = np.array(found[POSITIONS]).reshape(-1, 3)
-    assert np.abs(got - expected).max() < 2e-4 * np.abs(expected).max()
-    homogeneous = np.concatenate([mesh.positions, np.ones((count, 1))], axis=1)
+    error = np.abs(found[POSITIONS].reshape(-1, 3) - expected).max()
+    assert error < 2e-4 * np.abs(expected).max()
+    homogeneous = np.concatenate([mesh.positions, np.ones((len(w), 1))], axis=1)
     by_weight = np.einsum("bij,vj,vi->vb", m[:, :3], homogeneous, by_vertex)
     expected = w * (by_weight - (w * by_weight).sum(axis=1, keepdims=True))
-    got = np.array(found[WEIGHTS]).reshape(count, bones)
-    assert np.abs(got - expected).max() < 2e-4 * np.abs(expected).max()
+    error = np.abs(found[WEIGHTS].reshape(-1, BONES) - expected).max()
+    assert error < 2e-4 * np.abs(expected).max()
+
+
+HARD = {
+    "a bone that is a point": (np.diag([0.0, 0, 0, 1]), 1),
+    "all bones are points": (np.diag([0.0, 0, 0, 1]), BONES),
+    "a reflection": (np.diag([-1.0, 1, 1, 1]), BONES),
+    "half a turn": (np.diag([-1.0, -1, 1, 1]), 2),
+    "flat": (np.diag([1.0, 0, 1, 1]), BONES),
+}
+
+
+@pytest.mark.parametrize("name", HARD)
+def test_hard_poses_leave_finite_gradients(name: str) -> None:
+    matrix, bones = HARD[name]
+    matrices = np.tile(np.eye(4), (2, BONES, 1, 1))
+    matrices[1, :bones] = matrix
+    moving, _, grid, inputs = posed_problem(matrices)
+    assert all(np.isfinite(g).all() for g in gradients(moving, grid, inputs).values())
 
 
 def test_a_frame_in_its_own_coordinates_is_the_posed_asset(small: Asset) -> None:

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from appearance_opt.asset.rig import Channel, Clip, Path, Rig, Skin
+    from appearance_opt.asset.rig import Channel, Clip, Rig, Skin, TargetPath
     from appearance_opt.asset.types import Asset, Mesh
 
 
@@ -51,7 +51,7 @@ def node_matrices(
     """(T, N, 4, 4) from the coordinates of each node to the world at ``times`` (T,), seconds of a
     clip; at rest without one."""
     at = np.atleast_1d(np.asarray(times, np.float64))
-    moving: dict[int, dict[Path, NDArray]] = {}
+    moving: dict[int, dict[TargetPath, NDArray]] = {}
     for channel in () if clip is None else clip.channels:
         moving.setdefault(channel.node, {})[channel.path] = sample(channel, at)
     out = np.empty((len(at), len(rig.nodes), 4, 4))

@@ -22,10 +22,10 @@ from appearance_opt.errors import InputError
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-Path = Literal["translation", "rotation", "scale"]
+TargetPath = Literal["translation", "rotation", "scale"]
 Interpolation = Literal["LINEAR", "STEP", "CUBICSPLINE"]
 
-REST: dict[Path, tuple[float, ...]] = {
+REST: dict[TargetPath, tuple[float, ...]] = {
     "translation": (0.0, 0.0, 0.0),
     "rotation": (0.0, 0.0, 0.0, 1.0),
     "scale": (1.0, 1.0, 1.0),
@@ -76,7 +76,7 @@ class Channel:
     Before its first and after its last key it stands still."""
 
     node: int
-    path: Path
+    path: TargetPath
     times: NDArray[np.float64]
     values: NDArray[np.float64]
     interpolation: Interpolation = "LINEAR"
