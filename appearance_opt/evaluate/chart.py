@@ -18,7 +18,9 @@ TICKS = 5
 class Chart:
     """``title`` and ``lead``, a sentence; ``x``, ``y``: what the axes show; ``lines``: by name,
     points (x, y), x above 0 on a logarithmic axis; ``bound``: a level to stay below, if there is
-    one; ``marks``: places on the x axis by name."""
+    one; ``marks``: places on the x axis by name; ``ticks``: names of places there (none: numbers
+    where points are); ``linear``: is the x axis, which then goes from the first x to the last, and
+    the y axis as far as the values do?"""
 
     title: str
     lead: str
@@ -27,21 +29,27 @@ class Chart:
     lines: dict[str, list[tuple[float, float]]]
     bound: float | None = None
     marks: dict[str, float] = field(default_factory=dict)
+    ticks: dict[float, str] = field(default_factory=dict)
+    linear: bool = False
 
 
 def chart_svg(chart: Chart) -> str:
     """The chart."""
     points = [p for line in chart.lines.values() for p in line]
     xs = sorted({x for x, _ in points})
-    low, high = math.log2(xs[0]), math.log2(xs[-1])
+    across = float if chart.linear else math.log2
+    low, high = across(xs[0]), across(xs[-1])
     ys = [y for _, y in points] + ([] if chart.bound is None else [chart.bound])
     bottom, top = min(0.0, *ys), 1.05 * max(*ys, 1e-9)
+    if chart.linear:
+        margin = 0.1 * max(max(ys) - min(ys), 0.1)
+        bottom, top = min(ys) - margin, max(ys) + margin
 
     def at(x: float, y: float) -> tuple[float, float]:
-        across = (math.log2(x) - low) / max(high - low, 1e-9)
+        share = (across(x) - low) / max(high - low, 1e-9)
         up = (y - bottom) / (top - bottom)
         return (
-            LEFT + (WIDTH - LEFT - RIGHT) * across,
+            LEFT + (WIDTH - LEFT - RIGHT) * share,
             HEIGHT - BOTTOM - (HEIGHT - BOTTOM - TOP) * up,
         )
 
@@ -53,9 +61,10 @@ def chart_svg(chart: Chart) -> str:
             f'<line class="grid" x1="{LEFT}" x2="{WIDTH - RIGHT}" y1="{py:.1f}" y2="{py:.1f}"/>'
             f'<text x="{LEFT - 8}" y="{py + 4:.1f}" text-anchor="end">{y:.3g}</text>'
         )
-    for x in xs:
+    for x, name in (chart.ticks or {x: f"{x:g}" for x in xs}).items():
         px, py = at(x, bottom)
-        out.append(f'<text x="{px:.1f}" y="{py + 16:.1f}" text-anchor="middle">{x:g}</text>')
+        name = html.escape(name)
+        out.append(f'<text x="{px:.1f}" y="{py + 16:.1f}" text-anchor="middle">{name}</text>')
     if chart.bound is not None:
         _, py = at(xs[0], chart.bound)
         out.append(

@@ -32,6 +32,8 @@ from appearance_opt.publish import publishing
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from appearance_opt.evaluate.motion import Motion
+
 MAP_PIXELS, THUMB_PIXELS = 512, 84
 """Of a page's maps and of the small pictures that choose a view; the folder has maps as they are."""
 
@@ -57,7 +59,8 @@ class ReportData:
     rows (seconds, step, PSNR, loss); ``charts``: more of them; ``facts``: what was asked and done;
     ``by_size``: how different the two look at which size; ``sizes``: of "original" and "result";
     ``previews``: the same in 3D; ``links``: label and file, relative to the folder; ``options``:
-    what was asked for; ``azimuth``, ``elevation`` (degrees): from where the viewer looks first.
+    what was asked for; ``azimuth``, ``elevation`` (degrees): from where the viewer looks first;
+    ``motion``: of characters.
     """
 
     title: str
@@ -77,6 +80,7 @@ class ReportData:
     options: list[Option] = field(default_factory=list)
     azimuth: float = 35.0
     elevation: float = 18.0
+    motion: Motion | None = None
 
 
 def write_report(folder: Path, data: ReportData) -> None:
@@ -88,6 +92,10 @@ def write_report(folder: Path, data: ReportData) -> None:
             encoded[f"view{k}_{_slug(name)}.png"] = encode_png(pixels)
     for name, pixels in data.maps.items():
         encoded[f"map_{_slug(name)}.png"] = encode_png(pixels)
+    if data.motion is not None:
+        encoded["film.webp"] = data.motion.film
+        for name, pixels in data.motion.stills.items():
+            encoded[f"{_slug(name)}.png"] = encode_png(pixels)
     with publishing(folder / "report.html") as place:
         for name, content in encoded.items():
             place.with_name(name).write_bytes(content)
@@ -119,7 +127,13 @@ def as_json(data: ReportData) -> dict[str, Any]:
         "by_size": [asdict(a) for a in data.by_size],
         "charts": [asdict(c) for c in data.charts],
         "sizes": {name: asdict(a) for name, a in data.sizes.items()},
+        **({} if data.motion is None else {"motion": _frames(data.motion)}),
     }
+
+
+def _frames(motion: Motion) -> dict[str, Any]:
+    """Errors by frame."""
+    return {"clip": motion.clip, "frames": motion.frames, "psnr": motion.errors}
 
 
 def page(data: ReportData) -> str:
@@ -131,6 +145,7 @@ def page(data: ReportData) -> str:
         "cards": _cards(data.sizes),
         "stage": _stage(data),
         "measured": _measured(data),
+        "motion": _motion(data.motion),
         "sizes": _sizes(data.sizes),
         "maps": _maps(data.maps),
         "curve": _section(
@@ -222,6 +237,37 @@ def curve_svg(
         f'<svg viewBox="0 0 {width} {height}" role="img" aria-label="PSNR in dB against seconds">'
         f'{"".join(marks)}<polyline points="{points}"/>{dots}</svg>'
     )
+
+
+def _motion(motion: Motion | None) -> str:
+    """The film, what it was made of, and the error by frame."""
+    if motion is None:
+        return ""
+    address = "data:image/webp;base64," + base64.b64encode(motion.film).decode()
+    film = (
+        f"<figure class='film'><img src='{address}' alt='film of the clip {_html(motion.clip)}: "
+        "original, result, difference'><figcaption>original, result, and their difference, four "
+        f"times as bright: clip {_html(motion.clip)} at {motion.rate:g} frames per second"
+        "</figcaption></figure>"
+    )
+    told = {"worst frame": "the worst frame", "weights": "weights as colours of the bones"}
+    if motion.errors:
+        told["worst frame"] += f", {_html(motion.worst[0])}: {motion.worst[1]:.2f} dB"
+    stills = "".join(
+        f"<figure class='film'><img src='{_image(pixels, 85)}' alt='{_html(name)}' loading='lazy'>"
+        f"<figcaption>{told.get(name, _html(name))}</figcaption></figure>"
+        for name, pixels in motion.stills.items()
+    )
+    chart = ""
+    if len(motion.frames) > 1:
+        count = len(motion.frames)
+        shown = sorted({round(k * (count - 1) / 6) for k in range(7)})
+        ticks = {float(k): one_line(motion.frames[k]) for k in shown}
+        lines = {n: [(float(k), y) for k, y in enumerate(v)] for n, v in motion.errors.items()}
+        lead = "PSNR over covered pixels (dB) by frame."
+        drawn = Chart("", lead, "frame", "PSNR (dB)", lines, ticks=ticks, linear=True)
+        chart = f"<p class='lead'>{lead}</p>{chart_svg(drawn)}"
+    return _section("In motion", "", film + chart + stills)
 
 
 def _cards(sizes: dict[str, Sizes]) -> str:

@@ -15,6 +15,7 @@ from appearance_opt.asset.origin import ZERO
 from appearance_opt.asset.posing import pose_asset
 from appearance_opt.config import AnimateOptions, resolve_options, with_values
 from appearance_opt.errors import InputError
+from appearance_opt.evaluate.motion import show_motion
 from appearance_opt.jobs.lifecycle import close_run, load_source, name_of, open_run
 from appearance_opt.jobs.paths import Outputs
 from appearance_opt.jobs.result import SimplifyResult
@@ -33,9 +34,11 @@ if TYPE_CHECKING:
 
     from appearance_opt.asset.rig import Skin
     from appearance_opt.asset.types import Asset
+    from appearance_opt.evaluate.motion import Motion
     from appearance_opt.latent.latent import Latent
     from appearance_opt.optimize.loop import FitResult
     from appearance_opt.progress import Progress
+    from appearance_opt.stages.animation import Frame
     from appearance_opt.stages.parts import Parts
     from appearance_opt.stages.run import Run
     from appearance_opt.stages.start import Start
@@ -80,9 +83,20 @@ class FrameErrors:
 
 @dataclass
 class AnimateResult(SimplifyResult):
-    """``asset``: with the rig of the source. ``errors``: by frame; None without a report."""
+    """``asset``: with the rig of the source. ``errors``: by frame; None without a report.
+    ``source``: what it is filmed beside; ``worst``: the frame with the largest error."""
 
     errors: FrameErrors | None = None
+    source: Asset | None = None
+    worst: Frame | None = None
+
+    def motion(self) -> Motion | None:
+        """A film of the clip in which the worst frame is."""
+        if self.errors is None or self.source is None or self.worst is None:
+            return None
+        errors = {"start": self.errors.start, "result": self.errors.result}
+        clip, time = self.worst.clip, self.worst.time
+        return show_motion(self.source, self.asset, clip, time, self.errors.frames, errors)
 
     def record(self) -> dict[str, Any]:
         """The same as of a simplification, and the errors by frame."""
@@ -172,6 +186,8 @@ def _fit(
         names = tuple(str(animation.frames[k]) for k, _ in judge.frames)
         errors = FrameErrors(names, **{k: tuple(v) for k, v in scores.items()})  # type: ignore[arg-type]
         worst = judge.frames[int(np.argmin(errors.result))][0]
+        result.source = parts.with_kept(animation.asset)
+        result.worst = animation.frames[worst]
         result.errors, result.facts = errors, {**result.facts, **errors.lines()}
     result.columns = {n: _at(animation, a, worst) for n, a in result.columns.items()}
     result.notes = [*asset.notes, *start.notes, *result.notes]

@@ -18,6 +18,7 @@ from appearance_opt.config import CompareOptions, resolve_options
 from appearance_opt.errors import InputError
 from appearance_opt.evaluate.comparison import Comparison, compare_local
 from appearance_opt.evaluate.metrics import compare_images
+from appearance_opt.evaluate.motion import Motion, show_motion
 from appearance_opt.jobs.paths import Outputs
 from appearance_opt.jobs.report import write_compare_report
 from appearance_opt.placement import Placement
@@ -53,6 +54,7 @@ def compare(
         outputs.check_inputs(first, second)
         outputs.check_room(0, None)
         backend.select(options.device)
+        moving, motion = (first, second), None
         if options.clip is None:
             result = _compare(first, second, options)
         else:
@@ -60,7 +62,9 @@ def compare(
         if outputs.report is not None:
             points = np.concatenate([first.points(), second.points()])
             placement = Placement.around(points)
-            write_compare_report(outputs.report, first, second, placement, result, options)
+            if options.clip is not None:
+                motion = _film(*moving, options.clip, result)
+            write_compare_report(outputs.report, first, second, placement, result, options, motion)
     apart = _apart(first, second)
     told = (*first.notes, *second.notes, *apart, *_drawn_otherwise(first, second))
     return replace(result, notes=(*told, *result.notes))
@@ -109,6 +113,15 @@ def _compare_frames(
     result = Comparison(compare_images(reference, candidate), reference, candidate, notes, frames)
     a, b = (pose_asset(x, options.clip, float(worst)) for x in (first, second))
     return result, a, b
+
+
+def _film(first: Asset, second: Asset, clip: str, result: Comparison) -> Motion:
+    """Both over a clip, with the errors that were measured."""
+    assert first.rig is not None
+    numbers, psnr = zip(*result.frames, strict=True)
+    worst = numbers[int(np.argmin(psnr))] / first.rig.rate
+    names = [f"{clip} {n:g}" for n in numbers]
+    return show_motion(first, second, clip, worst, names, {"candidate": psnr})
 
 
 def _apart(reference: Asset, candidate: Asset) -> list[str]:

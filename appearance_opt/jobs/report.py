@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from appearance_opt.asset.types import Asset
     from appearance_opt.config import CommonOptions, CompareOptions
     from appearance_opt.evaluate.comparison import Comparison
+    from appearance_opt.evaluate.motion import Motion
     from appearance_opt.jobs.result import Result
     from appearance_opt.options.option import Record
     from appearance_opt.placement import Placement
@@ -77,6 +78,7 @@ def write_job_report(
         columns={name: text for name, text in told.items() if text},
         sizes=sizes,
         links=_links(folder, result.files),
+        motion=result.motion(),
         **{f.name: getattr(shown, f.name) for f in fields(shown)},
     )
     write_report(folder, data)
@@ -89,8 +91,9 @@ def write_compare_report(
     placement: Placement,
     result: Comparison,
     options: CompareOptions,
+    motion: Motion | None = None,
 ) -> None:
-    """Report of a comparison."""
+    """Report of a comparison; ``motion``: of characters."""
     original, other = placement.local(reference), placement.local(candidate)
     points = np.concatenate([a.points() for a in (original, other)])
     drawn = MeshReference(original)
@@ -124,6 +127,7 @@ def write_compare_report(
         previews={"original": preview_of(original), "result": preview_of(other)},
         azimuth=hero.azimuth,
         elevation=hero.elevation,
+        motion=motion,
     )
     write_report(folder, data)
 

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from appearance_opt.asset.types import Asset
     from appearance_opt.errors import DivergedError
     from appearance_opt.evaluate.chart import Chart
+    from appearance_opt.evaluate.motion import Motion
     from appearance_opt.optimize.loop import FitResult
     from appearance_opt.stages.export import Exported
     from appearance_opt.stages.parts import Parts
@@ -80,6 +81,10 @@ class Result:
             "seconds": self.seconds,
             "notes": self.notes,
         }
+
+    def motion(self) -> Motion | None:
+        """What a report shows of how it moves; None for what stands still."""
+        return None
 
     @property
     def drawn(self) -> Asset:
