@@ -106,7 +106,7 @@ class LatentTopology:
         )
         self.culled = culled(mesh.positions, mesh.faces, mesh.single)
         self._culled = None if self.culled is None else mi.Bool(self.culled)
-        self.edges = edge_list(self.welded_faces, self.culled)
+        self.edges = edge_list(self.welded_faces, self.culled, mesh.normal_faces)
         self.handedness = mi.Float(handedness(mesh))
         self._fixed = self._fixed_surface() if mesh.normals is not None else None
 

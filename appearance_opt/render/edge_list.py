@@ -26,16 +26,23 @@ class EdgeList:
     None without any. Of the face with the first opposite vertex: 1 if it is culled, 2 if it runs
     from a to b by its winding; of that with the other one: 4 and 8. Where an edge has more than two
     faces none of them is culled here: some are seen.
+
+    ``creased``: edges at which two faces with different normals meet: what is seen jumps there, as
+    at a silhouette; None without any.
     """
 
     packets: mi.UInt32
     count: int
     around: mi.UInt32 | None = None
     sides: mi.UInt32 | None = None
+    creased: mi.Bool | None = None
 
 
-def edge_list(faces: NDArray, culled: NDArray | None = None) -> EdgeList:
-    """List all edges of a welded mesh (F, 3). ``culled`` (F,): see ``Surface.culled``."""
+def edge_list(
+    faces: NDArray, culled: NDArray | None = None, normals: NDArray | None = None
+) -> EdgeList:
+    """List all edges of a welded mesh (F, 3). ``culled`` (F,): see ``Surface.culled``. ``normals``
+    (F, 3): numbers of the normals at the corners, where a vertex has several."""
     low, high, opposite, order, heads, uses = _sorted_edges(faces)
     second = np.minimum(heads + 1, len(low) - 1)
     other = np.where(uses == 2, opposite[second], high[heads])
@@ -46,7 +53,15 @@ def edge_list(faces: NDArray, culled: NDArray | None = None) -> EdgeList:
         bits = np.where(culled[face], 1, 0) + np.where(faces[face, corner] == low, 2, 0)
         bits = np.where(uses <= 2, bits[heads], 0) + np.where(uses == 2, 4 * bits[second], 0)
         sides = mi.UInt32(bits.astype(np.uint32))
-    return EdgeList(mi.UInt32(packets.ravel()), len(heads), sides=sides)
+    creased = None
+    if normals is not None:
+        corner, face = np.divmod(order, len(faces))
+        start, end = normals[face, corner], normals[face, (corner + 1) % 3]
+        runs_up = faces[face, corner] == low
+        at_low, at_high = np.where(runs_up, start, end), np.where(runs_up, end, start)
+        apart = (at_low[heads] != at_low[second]) | (at_high[heads] != at_high[second])
+        creased = mi.Bool(apart & (uses == 2))
+    return EdgeList(mi.UInt32(packets.ravel()), len(heads), sides=sides, creased=creased)
 
 
 def walkable(edges: EdgeList, faces: NDArray) -> EdgeList:

@@ -42,7 +42,8 @@ def prepare(options: argparse.Namespace) -> None:
     scene.world.node_tree.nodes["Background"].inputs[1].default_value = 0
     for material in bpy.data.materials:
         if options.no_bump_correction:
-            material.use_bump_map_correction = False
+            owner = material if hasattr(material, "use_bump_map_correction") else material.cycles
+            owner.use_bump_map_correction = False
 
 
 def main() -> None:

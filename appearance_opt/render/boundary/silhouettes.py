@@ -43,14 +43,17 @@ def edges_of(shown: Shown | Drawn) -> EdgeList:
 
 def is_silhouette(shown: Shown, edge: GatheredEdges, camera: Camera) -> mi.Bool:
     """Tell whether both faces of edges lie on one side of the plane through eye and edge. No
-    winding is needed, but for culled faces: what turns its back to the eye is not there."""
+    winding is needed, but for culled faces: what turns its back to the eye is not there. Creases
+    count as silhouettes: shading jumps there, and moves with them."""
     m = dr.cross(edge.a - camera.eye, edge.b - edge.a)
     side, other_side = (
         dr.dot(m, vertex_position(shown.surface, edge.corners[k]) - edge.a) for k in (2, 3)
     )
     boundary = edge.corners[3] == edge.corners[1]
     out = boundary | (side * other_side > 0)
-    sides = edges_of(shown).sides
+    sides, creased = edges_of(shown).sides, edges_of(shown).creased
+    if creased is not None:
+        out |= dr.gather(mi.Bool, creased, edge.index)
     if sides is None:
         return out
     bits = dr.gather(mi.UInt32, sides, edge.index)
