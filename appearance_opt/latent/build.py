@@ -10,11 +10,12 @@ import numpy as np
 
 from appearance_opt.latent.displacement import DISPLACEMENT, Height, Tessellation
 from appearance_opt.latent.latent import Latent
+from appearance_opt.latent.opacity import Opacity
 from appearance_opt.latent.parameter import Rates
 from appearance_opt.latent.parts import Pose
 from appearance_opt.latent.positions import Positions
 from appearance_opt.latent.skinning import SkinWeights
-from appearance_opt.latent.texels import NORMALS, Texels
+from appearance_opt.latent.texels import NORMALS, OPACITY, Texels
 from appearance_opt.render.material import CHANNELS
 
 if TYPE_CHECKING:
@@ -37,17 +38,18 @@ def latent_of(
     skinned: tuple[Skin, BoneFrames] | None = None,
 ) -> Latent:
     """A mesh with maps, of which what is named in ``fit`` is fitted: any of "shape", "normal",
-    "material" and "displacement".
+    "material", "opacity" and "displacement".
 
     ``maps``: natural values of every map, channel name -> (size, size), or a number for a channel
-    that is constant. The map "displacement" has a size of its own; with it, or with ``levels``
+    that is constant. With an image "opacity" the mesh is seen through, and drawn layer by layer. The
+    map "displacement" has a size of its own; with it, or with ``levels``
     other than (0,), the mesh is drawn tessellated, at one of ``levels`` at a time, at first at the
     last of them. ``skinned``: weights of the vertices, fitted with the "shape", and what the bones
     do in the frames of an animation, each of which is a pose.
     """
     wanted = frozenset(fit)
     images = {n: np.asarray(maps[n]) for n in CHANNELS if n in maps and np.ndim(maps[n])}
-    constants = {n: float(v) for n, v in maps.items() if not np.ndim(v)}
+    constants = {n: float(v) for n, v in maps.items() if not np.ndim(v) and n != OPACITY}
     parts: list[Part] = [Positions(mesh, "shape" in wanted)]
     if DISPLACEMENT in maps:
         image = np.asarray(maps[DISPLACEMENT])
@@ -63,6 +65,8 @@ def latent_of(
         group = {n: v for n, v in images.items() if (_group(n) in wanted) == fitted}
         if group:
             parts.append(Texels(group, fitted))
+    if OPACITY in maps:
+        parts.append(Opacity(np.atleast_2d(maps[OPACITY]), OPACITY in wanted))
     latent = Latent(mesh, tuple(parts), constants, poses)
     latent.set_rates(rates or Rates())
     return latent

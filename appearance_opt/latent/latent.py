@@ -162,9 +162,16 @@ class Latent:
 
     def maps(self, decoded: Decoded | None = None) -> MaterialMaps:
         """All maps; by default as they are now."""
-        shown = (p for p in self.parts if p.channels)
-        layers = (layer for p in shown for layer in p.layers(_value(p, decoded)))
-        return MaterialMaps(tuple(layers), self.constants)
+        shown = [(p, _value(p, decoded)) for p in self.parts if p.channels]
+        layers = tuple(layer for p, value in shown for layer in p.layers(value))
+        coverages = (p.coverage(value) for p, value in shown)
+        coverage = next((c for c in coverages if c is not None), None)
+        return MaterialMaps(layers, self.constants, coverage=coverage)
+
+    @property
+    def seen_through(self) -> bool:
+        """Does it keep back less than all of the light behind it?"""
+        return self.maps().coverage is not None
 
     def drawn(
         self, decoded: Decoded | None = None, surface: Surface | None = None, walkable: bool = False

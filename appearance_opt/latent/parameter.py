@@ -41,3 +41,4 @@ class Rates:
     material: float = 0.005
     displacement: float = 0.01
     weight: float = 0.05
+    opacity: float = 0.01

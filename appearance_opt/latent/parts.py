@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from appearance_opt.latent.mesh import LatentMesh
     from appearance_opt.latent.parameter import Parameter, Rates
-    from appearance_opt.render.material import TexelLayer
+    from appearance_opt.render.material import Coverage, TexelLayer
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,6 +81,10 @@ class Part:
     def layers(self, decoded: Any) -> tuple[TexelLayer, ...]:
         """The maps that it adds to the material."""
         return ()
+
+    def coverage(self, decoded: Any) -> Coverage | None:
+        """What the material keeps back of the light behind it, if this part says so."""
+        return None
 
     def fixed(self) -> tuple:
         """Everything that the pure functions read and that no step changes."""

@@ -37,7 +37,9 @@ BOUNDS = {
     "normal_y": (-1.0, 1.0),
     "normal_z": (0.05, 1.0),
     "displacement": (-1.0, 1.0),
+    "opacity": (0.0, 1.0),
 }
+OPACITY = "opacity"
 NORMALS = ("normal_x", "normal_y", "normal_z")
 MAX_LEVELS = 7
 """Levels of a fitted pyramid: no view minifies an atlas by more than 2^6."""

@@ -76,6 +76,7 @@ class Gradients:
         freeze: bool = True,
     ) -> None:
         self.latent, self.grid, self.loss = latent, grid, loss
+        quality = quality.peeling() if latent.seen_through else quality
         self.quality = replace(quality, defer=gradient.DEFERRED)
         self.laplacians = laplacians or {}
         self._edges = {p.level: latent.edges(p, quality.walks) for p in latent.poses}

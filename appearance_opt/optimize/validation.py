@@ -9,7 +9,7 @@ import numpy as np
 from appearance_opt.errors import DivergedError
 from appearance_opt.reference.pool import check_images
 from appearance_opt.render.display import display
-from appearance_opt.render.images import render_image
+from appearance_opt.render.layers import renderer_of
 from appearance_opt.render.pixels import Batch, Grid
 
 if TYPE_CHECKING:
@@ -40,7 +40,8 @@ class Validation:
         """The latent in the held-out views: (B, H, W, 4) premultiplied linear radiance and
         coverage."""
         batch = Batch(self.views.records(), self._grid)
-        image = render_image(latent.drawn(), batch, self.samples)
+        drawn = latent.drawn()
+        image = renderer_of(drawn.maps.coverage).render_image(drawn, batch, self.samples)
         return np.array(image).reshape(len(self.views), self.resolution, self.resolution, 4)
 
     def psnr(self, latent: Latent) -> float:

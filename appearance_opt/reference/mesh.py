@@ -16,10 +16,10 @@ from appearance_opt.asset.hierarchy import owners
 from appearance_opt.asset.sides import culled, single_sided
 from appearance_opt.asset.tangents import any_tangent, split_and_tangents
 from appearance_opt.reference.textures import coverage_maps, emission_maps, material_maps
-from appearance_opt.render import images, pixels
+from appearance_opt.render import pixels
 from appearance_opt.render.drawn import Drawn
 from appearance_opt.render.freezing import Frozen
-from appearance_opt.render.layers import SeenThrough
+from appearance_opt.render.layers import renderer_of
 from appearance_opt.render.material import UNLIT, MaterialMaps
 from appearance_opt.render.surface import Surface
 from appearance_opt.render.upload import MeshArrays
@@ -65,7 +65,7 @@ class MeshReference:
         self._hidden_backs = culled(m.positions, m.faces, self.single, passing)
         uvs = m.uvs if self._needs_uvs(maps) else None
         self.drawn = Drawn.of(replace(m, uvs=uvs, culled=self._hidden_backs), maps)
-        self._renderer: Renderer = images if self.coverage is None else SeenThrough(self.coverage)
+        self._renderer: Renderer = renderer_of(self.coverage)
         self._run = Frozen(self.surface, self.maps, self.coverage)
         self._grid: pixels.Grid | None = None
 

@@ -29,7 +29,7 @@ from appearance_opt.render.freezing import traced
 from appearance_opt.render.passing import MISS
 from appearance_opt.render.pixels import Batch, add_colors
 from appearance_opt.render.samples import Samples
-from appearance_opt.render.shading import shade
+from appearance_opt.render.shading import shade, shade_layer
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -80,11 +80,14 @@ def render(
 
 def _averages(shown: Shown, batch: Batch, seen: Seen) -> tuple[mi.Float, list[mi.ArrayXf]]:
     """(image without the deferred pixels, contrast of each boundary)."""
-    image = dr.zeros(mi.Float, batch.grid.pixels * 4)
-    if (averaged := seen.averaged) is not None:
+    image = dr.zeros(mi.Float, batch.grid.pixels * 4) if seen.image is None else seen.image
+    if (averaged := seen.averaged) is not None and seen.image is None:
         color = shade(shown, batch, averaged.samples, averaged.width)
         add_colors(image, color, averaged.weight, averaged.pixel, dr.ReduceMode.Local)
-    contrasts = [_contrast(shown, batch, b, seen.width) for b in seen.boundaries]
+    contrasts = [
+        _contrast(shown, batch, b, seen.width) if b.contrast is None else b.contrast
+        for b in seen.boundaries
+    ]
     if seen.rays is not None and contrasts:
         dr.eval(image, contrasts)
         for boundary, contrast in zip(seen.boundaries, contrasts, strict=True):
@@ -114,9 +117,16 @@ def surrogate(rendered: RenderedBatch, shown: Shown, image_gradient: mi.Float) -
     """
     terms, batch, seen = [], rendered.batch, rendered.seen
     if (averaged := seen.averaged) is not None:
-        color = shade(shown, batch, averaged.samples, averaged.width)
         g = _pixel(image_gradient, averaged.pixel)
-        product = dr.fma(g[0], color.x, dr.fma(g[1], color.y, g[2] * color.z))
+        if averaged.behind is None:
+            color = shade(shown, batch, averaged.samples, averaged.width)
+            product = dr.fma(g[0], color.x, dr.fma(g[1], color.y, g[2] * color.z))
+        else:
+            # a layer covers what is behind it: alpha (c - behind), with what is behind held fixed
+            color, alpha = shade_layer(shown, batch, averaged.samples, averaged.width)
+            b = averaged.behind
+            product = dr.fma(g[0], color.x - b[0], g[1] * (color.y - b[1]))
+            product = dr.fma(g[2], color.z - b[2], dr.fma(g[3], 1 - b[3], product)) * alpha
         terms.append(product * averaged.weight)
     if dr.grad_enabled(shown.surface.vertices):
         for b in seen.boundaries:

@@ -18,7 +18,10 @@ import mitsuba as mi
 from appearance_opt.render import images
 from appearance_opt.render.camera import camera_of, direction
 from appearance_opt.render.freezing import traced
-from appearance_opt.render.material import TexelLayer
+
+# not only for the type checker: Dr.Jit resolves the annotations of data classes when it looks for
+# arrays
+from appearance_opt.render.material import Coverage
 from appearance_opt.render.passing import MISS, meet
 from appearance_opt.render.pixels import add_colors, pixel_index
 from appearance_opt.render.samples import Samples
@@ -29,10 +32,9 @@ from appearance_opt.render.visibility import Visible
 if TYPE_CHECKING:
     from appearance_opt.render.drawn import Drawn, Shown
     from appearance_opt.render.freezing import Run
-    from appearance_opt.render.images import Footprint
+    from appearance_opt.render.images import Footprint, Renderer
     from appearance_opt.render.passing import Scene
     from appearance_opt.render.pixels import Batch
-    from appearance_opt.render.surface import Hit
 
 MOST = 128
 """Layers that a ray is followed through, empty parts of cut-outs included. What lies behind is not
@@ -42,22 +44,7 @@ LEAST = 1 / 1024
 """Share of a ray that is not worth following: a quarter of an 8-bit step."""
 
 CHANNELS = ("coverage", "cutoff")
-"""Channels of the maps of coverage. Where there is a cutoff (not negative), coverage is tested
-against it."""
-
-
-@dataclass(frozen=True)
-class Coverage:
-    """What each material of a surface keeps back: ``layer`` with the ``CHANNELS``."""
-
-    layer: TexelLayer
-
-    def at(self, hit: Hit) -> mi.Float:
-        """Return the share in [0, 1] at each hit."""
-        share, cutoff = self.layer.at(hit)[:2]
-        if hit.alpha is not None:
-            share *= hit.alpha
-        return dr.select(cutoff < 0, share, dr.select(share >= cutoff, mi.Float(1), mi.Float(0)))
+"""Channels of the maps of coverage of a reference, see ``Coverage``."""
 
 
 @dataclass(frozen=True)
@@ -118,9 +105,14 @@ class SeenThrough:
                 break
             seen, light = seen.keep(left), dr.gather(mi.Float, light, left)
             dr.eval(seen, light)
-            seen = run(_behind, drawn.scene, batch, seen)
+            seen = run(behind, drawn.scene, batch, seen)
             dr.eval(seen)
         return image
+
+
+def renderer_of(coverage: Coverage | None) -> Renderer:
+    """Return what draws a surface that keeps back so much (None: all) of the light behind it."""
+    return images if coverage is None else SeenThrough(coverage)
 
 
 def _kept_back(
@@ -155,8 +147,8 @@ def _accumulate(
     return out
 
 
-def _behind(scene: Scene, batch: Batch, seen: Visible) -> Visible:
-    """What the rays meet next."""
+def behind(scene: Scene, batch: Batch, seen: Visible) -> Visible:
+    """Find what rays meet behind what they have ``seen``, which must be hits."""
     hits = seen.samples
     camera = camera_of(batch.records, hits.view)
     d = direction(camera, hits.x, hits.y, batch.grid.size)

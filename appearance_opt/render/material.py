@@ -55,15 +55,35 @@ class TexelLayer:
 
 
 @dataclass(frozen=True)
+class Coverage:
+    """The share that each material keeps back of the light behind it: the first channel of
+    ``layer``. A second one is a cutoff that the share is tested against where it is not
+    negative."""
+
+    layer: TexelLayer
+
+    def at(self, hit: Hit) -> mi.Float:
+        """Return the share in [0, 1] at each hit."""
+        values = self.layer.at(hit)
+        share = values[0] if hit.alpha is None else values[0] * hit.alpha
+        if len(self.layer.channels) == 1:
+            return share
+        cutoff = values[1]
+        return dr.select(cutoff < 0, share, dr.select(share >= cutoff, mi.Float(1), mi.Float(0)))
+
+
+@dataclass(frozen=True)
 class MaterialMaps:
     """Everything that is known of the materials of a surface: ``layers`` of maps (a fit keeps the
     maps that move and those that do not in different layers) and ``constants`` for the channels
     without one. ``unlit``: which of several materials are shown without light, None if none is; all
-    of them are with the constant ``UNLIT``."""
+    of them are with the constant ``UNLIT``. ``coverage``: what they keep back of the light behind
+    them, where a fit draws them layer by layer; None if all of it."""
 
     layers: tuple[TexelLayer, ...] = ()
     constants: Mapping[str, float] = field(default_factory=dict)
     unlit: mi.Bool | None = None
+    coverage: Coverage | None = None
 
     @property
     def has_normal_map(self) -> bool:

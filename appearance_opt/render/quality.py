@@ -3,10 +3,11 @@ gradients."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from appearance_opt.render.boundary.camera_rays import CameraRays
 from appearance_opt.render.boundary.estimator import Estimator
+from appearance_opt.render.boundary.peeled import Peeled
 from appearance_opt.render.sampling import Sampling
 
 
@@ -20,6 +21,12 @@ class Quality(Sampling):
 
     def __post_init__(self) -> None:
         self.visibility.check(self)
+
+    def peeling(self) -> Quality:
+        """Return the same for what is seen through: layers are peeled, if they are not yet."""
+        if isinstance(self.visibility, Peeled):
+            return self
+        return replace(self, visibility=Peeled())
 
     @property
     def walks(self) -> bool:

@@ -34,12 +34,16 @@ class Samples:
 @dataclass
 class Weighted:
     """Covered camera rays, the ``pixel`` of each and its ``weight`` there, and their ``width`` in
-    pixels, which selects mip levels."""
+    pixels, which selects mip levels.
+
+    ``behind``: what is seen behind each, premultiplied RGB and coverage, if the surface is seen
+    through (``weight`` is then that of the light that reaches it); None where nothing is."""
 
     samples: Samples
     pixel: mi.UInt32
     weight: mi.Float
     width: mi.Float
+    behind: mi.ArrayXf | None = None
 
 
 @dataclass

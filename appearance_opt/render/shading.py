@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from appearance_opt.render.drawn import Shown
     from appearance_opt.render.pixels import Batch
     from appearance_opt.render.samples import Samples
+    from appearance_opt.render.surface import Hit
 
 NEAREST_LIGHT = 1e-3
 """Distance below which a light gets no brighter (the object's radius is 1 in a fit): a point light
@@ -31,7 +32,24 @@ def shade(shown: Shown, batch: Batch, samples: Samples, width: mi.Float) -> mi.C
     """Return the radiance towards the camera at each sample (all must be hits). Linear RGB.
     ``width``: width of a sample in pixels, which selects the mip level."""
     camera = camera_of(batch.records, samples.view)
+    return _radiance(
+        shown, camera, interpolate(shown.surface, camera, samples, batch.grid.size, width)
+    )
+
+
+def shade_layer(
+    shown: Shown, batch: Batch, samples: Samples, width: mi.Float
+) -> tuple[mi.Color3f, mi.Float]:
+    """Return the same, and the share in [0, 1] that the surface keeps back of the light behind
+    it."""
+    camera = camera_of(batch.records, samples.view)
     hit = interpolate(shown.surface, camera, samples, batch.grid.size, width)
+    coverage = shown.maps.coverage
+    return _radiance(shown, camera, hit), mi.Float(1) if coverage is None else coverage.at(hit)
+
+
+def _radiance(shown: Shown, camera: Camera, hit: Hit) -> mi.Color3f:
+    """The radiance of a surface towards the camera at hits."""
     sample = material.evaluate(shown.maps, hit)
     if sample.unlit is True:
         return sample.base_color

@@ -14,7 +14,7 @@ from appearance_opt.latent.texels import NORMALS, Texels
 from appearance_opt.reference.pool import check_images
 from appearance_opt.render.display import display
 from appearance_opt.render.drawn import Drawn
-from appearance_opt.render.images import render_image
+from appearance_opt.render.layers import renderer_of
 from appearance_opt.render.material import COLORS
 from appearance_opt.render.pixels import Batch, Grid
 from appearance_opt.views import VALIDATION
@@ -193,7 +193,11 @@ class Pictures:
     def _drawn(self, maps: Mapping[str, NDArray | float]) -> NDArray[np.float32]:
         model, batch = self._model, Batch(self._views.records(), Grid(VIEWS, self._resolution))
         codec = self._texels.codec
-        layer = {self._texels.name: codec.layer(codec.encode(maps))}
-        drawn = Drawn(model.scene, model.surface(model.vertices()), model.maps(layer))
-        image = render_image(drawn, batch, SAMPLES)
+        decoded = {
+            **model.decode(model.values()),
+            self._texels.name: codec.layer(codec.encode(maps)),
+        }
+        shown = model.maps(decoded)
+        drawn = Drawn(model.scene, model.surface(model.vertices()), shown)
+        image = renderer_of(shown.coverage).render_image(drawn, batch, SAMPLES)
         return display(np.array(image).reshape(VIEWS, self._resolution, self._resolution, 4))

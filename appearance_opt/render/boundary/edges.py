@@ -15,8 +15,8 @@ or leave the image by far (``_candidates``).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import mitsuba as mi
@@ -35,6 +35,8 @@ from appearance_opt.render.samples import Samples
 from appearance_opt.render.surface import vertex_position
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from appearance_opt.render.drawn import Drawn, Shown
     from appearance_opt.render.freezing import Run
     from appearance_opt.render.pixels import Batch, Grid
@@ -139,6 +141,18 @@ class Edges:
     ) -> EdgePoints | None:
         """See ``Finder``: visible points, stratified along the total length; ``seed`` moves them
         within their strata."""
+        points = self.spread(_points, drawn, drawn, batch, seed, run)
+        if points is None:
+            return None
+        points, visible = points
+        kept = dr.compress(visible)
+        return points.keep(kept) if dr.width(kept) else None
+
+    def spread(
+        self, place: Callable, seen: Any, drawn: Drawn, batch: Batch, seed: int, run: Run
+    ) -> Any:
+        """Return ``place(seen, batch, strata, number, seed)`` of points along the total length of
+        silhouettes, hidden ones included; None without any."""
         index, length = silhouette_edges(drawn, batch, run)
         if dr.width(index) == 0:
             return None
@@ -154,9 +168,7 @@ class Edges:
             dr.opaque(mi.UInt32, dr.width(upper) - 1),
             dr.opaque(mi.Float64, total / count),
         )
-        points, visible = run(_points, drawn, batch, strata, number, dr.opaque(mi.UInt32, seed))
-        kept = dr.compress(visible)
-        return points.keep(kept) if dr.width(kept) else None
+        return run(place, seen, batch, strata, number, dr.opaque(mi.UInt32, seed))
 
 
 def silhouette_edges(drawn: Drawn, batch: Batch, run: Run = traced) -> tuple[mi.UInt32, mi.Float]:
@@ -200,7 +212,23 @@ def _points(
     drawn: Drawn, batch: Batch, strata: Strata, number: mi.UInt32, seed: mi.UInt32
 ) -> tuple[EdgePoints, mi.Bool]:
     """The points of the given numbers along the silhouettes, and whether each is visible."""
-    shown, size, rows = drawn.shown, batch.grid.size, batch.grid.rows
+    points, visible, depth = place_points(drawn.shown, batch, strata, number, seed)
+    hits = []
+    for side in (points.inside, points.outside):
+        hit, hit_depth = rays.trace_depth(drawn.scene, batch, side.view, side.x, side.y)
+        visible &= hit_depth > depth * (1 - DEPTH_SLACK)
+        hits.append(hit)
+    # an edge with the same face (or nothing) on both sides has no contrast
+    visible &= hits[0].triangle != hits[1].triangle
+    return replace(points, inside=hits[0], outside=hits[1]), visible
+
+
+def place_points(
+    shown: Shown, batch: Batch, strata: Strata, number: mi.UInt32, seed: mi.UInt32
+) -> tuple[EdgePoints, mi.Bool, mi.Float]:
+    """Return (the points of the given numbers along the silhouettes, with the edge's own number for
+    what is seen on both sides; whether each lies in the image; their depth)."""
+    size, rows = batch.grid.size, batch.grid.rows
     count = edges_of(shown).count
     at = (mi.Float64(number) + mi.Float64(mi.sample_tea_float32(number, seed))) * strata.spacing
     found = _first_not_below(strata.upper, at, strata.last, batch.grid.views * count)
@@ -223,21 +251,14 @@ def _points(
     nx, ny = nx * scale, ny * scale
     x, y = dr.lerp(ax, bx, s), dr.lerp(ay, by, s)
     depth = dr.rcp(dr.lerp(dr.rcp(az), dr.rcp(bz), s))
-    hits = []
-    visible = (x > 0) & (y > 0) & (x < size) & (y < size)
+    within = (x > 0) & (y > 0) & (x < size) & (y < size)
+    sides = []
     for sign in (-OFFSET, OFFSET):
         away = size * sign
-        hit, hit_depth = rays.trace_depth(
-            drawn.scene, batch, view, dr.fma(nx, away, x), dr.fma(ny, away, y)
-        )
-        visible &= hit_depth > depth * (1 - DEPTH_SLACK)
-        hits.append(hit)
-    # an edge with the same face (or nothing) on both sides has no contrast
-    visible &= hits[0].triangle != hits[1].triangle
+        sides.append(Samples(view, dr.fma(nx, away, x), dr.fma(ny, away, y), edge.index))
     pixel = (view * rows + mi.UInt32(y)) * rows + mi.UInt32(x)
-    return EdgePoints(
-        edge.index, view, s, pixel, mi.Float(strata.spacing), nx, ny, hits[0], hits[1]
-    ), visible
+    points = EdgePoints(edge.index, view, s, pixel, mi.Float(strata.spacing), nx, ny, *sides)
+    return points, within, depth
 
 
 def _first_not_below(

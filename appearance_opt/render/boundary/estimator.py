@@ -57,7 +57,8 @@ class Seen:
     left out of it, with all of their rays (see ``Sampling.defer``); ``crossed``: indices of the
     pixels that boundaries change, each once; None without any. ``width``: texture filter of
     contrasts in pixels. ``rays``: in each crossed pixel, if boundaries are to correct the image for
-    what these miss; None if nothing is missed.
+    what these miss; None if nothing is missed. ``image``: (pixels * 4) that of ``averaged``, if the
+    estimator had to shade it to see; the contrasts of its boundaries are known then.
     """
 
     averaged: Weighted | None
@@ -66,6 +67,7 @@ class Seen:
     width: mi.Float
     rays: int | None = None
     boundaries: list[Boundary] = field(default_factory=list)
+    image: mi.Float | None = None
 
 
 class Estimator:
