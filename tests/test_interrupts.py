@@ -14,7 +14,7 @@ from appearance_opt.asset import load
 from appearance_opt.asset.types import Asset
 from appearance_opt.config import simplify_options
 from appearance_opt.interrupts import Interrupts
-from appearance_opt.jobs import lifecycle as job
+from appearance_opt.jobs.result import Result
 from appearance_opt.optimize.validation import Validation
 
 
@@ -83,7 +83,7 @@ def test_the_result_survives_two_interrupts(
             if step == 2:
                 when(next(moments))
 
-    look, write = Validation.psnr, job.write
+    look, write = Validation.psnr, Result.write
 
     def looked(self: Validation, model: object) -> float:
         if count and moments.__length_hint__() == 2:
@@ -95,7 +95,7 @@ def test_the_result_survives_two_interrupts(
         write(*given)
 
     monkeypatch.setattr(Validation, "psnr", looked)
-    monkeypatch.setattr(job, "write", written)
+    monkeypatch.setattr(Result, "write", written)
     options = simplify_options(
         triangles=150, steps=100_000, texture_size=32, resolution=32, pool=4, views=2, reallocate=0
     )
