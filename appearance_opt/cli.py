@@ -124,7 +124,8 @@ def simplify(
     as_json: Json = False,
 ) -> None:
     """Run a job whose state can be kept: ``simplify`` or ``lod``."""
-    spec = given.spec(out, config, frozenset({"triangles", "ratio"}))
+    counts = {"triangles", "ratio"} | ({"max_error"} if given.kind == "simplify" else set())
+    spec = given.spec(out, config, frozenset(counts))
     kept = {"checkpoint": checkpoint, "resume": resume}
     _run(spec, as_json, _folder(out, report, no_report), _files(config), **kept)
 

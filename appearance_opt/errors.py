@@ -49,3 +49,7 @@ class ReferenceRenderError(AppearanceError):
 
 class DivergedError(AppearanceError):
     """The fit met repeated non-finite gradients (names parameter and iteration)."""
+
+
+class BoundError(AppearanceError):
+    """A result keeps within its bound less well than was asked for (says by how much)."""

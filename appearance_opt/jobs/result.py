@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from appearance_opt.asset.file_options import FileOptions
     from appearance_opt.asset.types import Asset
-    from appearance_opt.errors import DivergedError
+    from appearance_opt.errors import AppearanceError, DivergedError
     from appearance_opt.evaluate.chart import Chart
     from appearance_opt.evaluate.motion import Motion
     from appearance_opt.optimize.loop import FitResult
@@ -33,8 +33,8 @@ class Result:
     ``title`` of a report, ``facts`` that it lists by name, ``pictures`` (H, W, 3) that it shows
     beside those of the maps, ``charts`` that it draws. ``notes``: what the user should know, a line each. ``seconds``:
     wall-clock time by stage. ``files``: those that hold the asset, if it was written, the main one
-    first. ``error``: set when the fit diverged (jobs raise it after the best
-    state is written).
+    first. ``error``: set when the fit diverged, or a bound that is strict was
+    not met (jobs raise it after the best state is written).
     """
 
     asset: Asset
@@ -47,7 +47,7 @@ class Result:
     notes: list[str] = field(default_factory=list)
     seconds: dict[str, float] = field(default_factory=dict)
     files: tuple[Path, ...] = ()
-    error: DivergedError | None = None
+    error: AppearanceError | None = None
 
     def write(self, asset: Asset, path: Path, options: FileOptions) -> None:
         """Write the files of ``asset``, what its format can hold of the result, where they are to

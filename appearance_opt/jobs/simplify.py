@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from appearance_opt import __version__, backend
-from appearance_opt.config import SimplifyOptions, resolve_options
+from appearance_opt.config import SimplifyOptions, resolve_options, with_values
 from appearance_opt.digest import digest
 from appearance_opt.errors import InputError
 from appearance_opt.jobs.lifecycle import (
@@ -21,11 +21,13 @@ from appearance_opt.jobs.lifecycle import (
 )
 from appearance_opt.jobs.paths import Outputs
 from appearance_opt.jobs.result import SimplifyResult
+from appearance_opt.jobs.smallest import TRIALS, find_smallest
 from appearance_opt.optimize.checkpoint import Checkpointer
 from appearance_opt.reference.subject import Subject
 from appearance_opt.stages.choice import choose_start
 from appearance_opt.stages.export import Exporter, export
 from appearance_opt.stages.fitting import fit_start
+from appearance_opt.stages.levels import RESOLUTIONS, KeptLevels
 from appearance_opt.stages.parts import split
 from appearance_opt.stages.start import atlas_of
 
@@ -65,7 +67,7 @@ def simplify(
     the third one gives it up; once the result is written it ends the report. Raises
     AppearanceError.
     """
-    options = resolve_options(SimplifyOptions, options, values)
+    options = for_size(resolve_options(SimplifyOptions, options, values))
     outputs = Outputs.of(out, options, report=report, checkpoint=checkpoint)
     named = (source, options.start.file, *inputs)
     with open_run(outputs, named, options, progress, began) as run:
@@ -82,13 +84,22 @@ def simplify(
         parts = parts.merged() if options.parts.parts == "merge" else parts
         run.lap("load")
         backend.select(options.device)
+        searching, kept = options.start.max_error is not None, None
         if outputs.checkpoint is not None:
             job = fingerprint(options, asset, first)
-            run.checkpointer = Checkpointer(outputs.checkpoint, job, resume, CHECKPOINT_SECONDS)
+            if searching:
+                kept = KeptLevels(
+                    outputs.checkpoint, job, resume, CHECKPOINT_SECONDS, TRIALS, "trial"
+                )
+            else:
+                run.checkpointer = Checkpointer(outputs.checkpoint, job, resume, CHECKPOINT_SECONDS)
         run.begin(f"preparing {parts.fitted.triangle_count:,} triangles")
         subject = Subject.of_asset(parts.fitted, options.views.seed, options.views.light)
         run.lap("reference")
-        result = _fit(subject, parts, first, options, run)
+        if searching:
+            result = find_smallest(subject, parts, options, run, kept)
+        else:
+            result = _fit(subject, parts, first, options, run)
 
         def shown() -> Subject:
             if not parts.kept:
@@ -120,6 +131,14 @@ def _fit(
     source = (asset.name, asset.triangle_count)
     notes += [*start.notes, *parts.describe_nodes(exported.asset)]
     return SimplifyResult.of(exported, parts, fit, source, notes, error)
+
+
+def for_size(options: SimplifyOptions) -> SimplifyOptions:
+    """The same options, with views of the size on screen that is asked for."""
+    if options.start.pixels is None:
+        return options
+    low, high = RESOLUTIONS
+    return with_values(options, resolution=min(max(options.start.pixels, low), high))
 
 
 def fingerprint(options: SimplifyOptions, asset: Asset, first: Asset | None) -> str:

@@ -99,6 +99,7 @@ class JointOptions(CommonOptions):
 class AnimateOptions(SimplifyOptions):
     """How to simplify what is animated. With "shape", weights are fitted, too."""
 
+    start: StartOptions = part(StartOptions, without=("max_error", "pixels", "strict"))
     displacement: DisplacementOptions = part(DisplacementOptions, only=())
     animation: AnimationOptions = part(AnimationOptions)
 
@@ -107,7 +108,9 @@ class AnimateOptions(SimplifyOptions):
 class ConvertOptions(SimplifyOptions):
     """How to convert what is no mesh: there are no triangles to take a ratio of, no parts."""
 
-    start: StartOptions = part(ConvertStartOptions, without=("ratio",))
+    start: StartOptions = part(
+        ConvertStartOptions, without=("ratio", "max_error", "pixels", "strict")
+    )
     parts: PartOptions = part(PartOptions, only=())
 
 

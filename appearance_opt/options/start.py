@@ -7,13 +7,15 @@ from pathlib import Path
 from typing import ClassVar
 
 from appearance_opt.errors import InputError
+from appearance_opt.options.bound import LARGEST, SMALLEST, bound_text
 from appearance_opt.options.option import Record, check_choice, option
 
 
 @dataclass(frozen=True)
 class StartOptions(Record):
-    """``triangles`` or ``ratio``: the budget (exactly one; neither is needed where ``init`` is a
-    file). ``INITS``: what ``init`` may be apart from a file."""
+    """``triangles``, ``ratio`` or ``max_error``: the budget (exactly one; none is needed where
+    ``init`` is a file). ``pixels``: size on screen for which the result is made, and at which its
+    error is measured. ``INITS``: what ``init`` may be apart from a file."""
 
     INITS: ClassVar[tuple[str, ...]] = ("decimate", "sphere")
 
@@ -22,6 +24,25 @@ class StartOptions(Record):
     )
     ratio: float | None = option(
         None, "Fraction of the input's triangles instead.", panel="Start", above=0, high=1
+    )
+    max_error: str | None = option(
+        None,
+        "The fewest triangles whose error is at most 0.5px (of silhouettes), flip=0.02 or psnr=35.",
+        panel="Start",
+        metavar="BOUND",
+        parse=bound_text,
+    )
+    pixels: int | None = option(
+        None,
+        "Size on screen for which the result is made, instead of --resolution, and at which "
+        "--max-error is measured.",
+        panel="Start",
+        low=SMALLEST,
+        high=LARGEST,
+        automatic="--resolution",
+    )
+    strict: bool = option(
+        False, "End with exit code 2 if --max-error cannot be met.", panel="Start", flag="--strict"
     )
     init: str = option(
         "decimate",
@@ -36,8 +57,15 @@ class StartOptions(Record):
 
     def __post_init__(self) -> None:
         given = (self.triangles is not None) + (self.ratio is not None)
+        if self.max_error is not None and given:
+            raise InputError("--max-error looks for the triangles: leave --triangles, --ratio out")
+        if self.max_error is not None and self.init != "decimate":
+            raise InputError(f"--max-error: works with --init decimate, not {self.init}")
+        if self.strict and self.max_error is None:
+            raise InputError("--strict needs --max-error BOUND")
+        given += self.max_error is not None
         if given == 2 or (given == 0 and self.init in self.INITS):
-            raise InputError("give either --triangles N or --ratio R")
+            raise InputError("give either --triangles N or --ratio R, or --max-error BOUND")
         super().__post_init__()
         if self.file is None:
             check_choice("init", self.init, self.INITS)

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from appearance_opt.asset.rig import Skin
-    from appearance_opt.asset.types import Asset
+    from appearance_opt.asset.types import Asset, Credits
     from appearance_opt.config import CommonOptions
     from appearance_opt.latent.latent import Latent
     from appearance_opt.latent.mesh import LatentMesh
@@ -99,8 +99,20 @@ class Exporter:
             meshes=tuple(meshes),
             origin=like.origin,
             nodes=like.nodes,
-            credits=like.credits,
+            credits=_credits(like),
         )
+
+
+OURS = "appearance_opt"
+"""Key of what we say of a result in the extras of its file."""
+
+
+def _credits(like: Asset) -> Credits:
+    """Those of an asset, without what an earlier run has said of it: that is true no more."""
+    extras = like.credits.extras
+    if not isinstance(extras, dict) or OURS not in extras:
+        return like.credits
+    return replace(like.credits, extras={k: v for k, v in extras.items() if k != OURS} or None)
 
 
 def write_companion(asset: Asset, out: Path) -> None:

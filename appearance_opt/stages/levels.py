@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from appearance_opt.asset.types import Asset
-    from appearance_opt.config import LodOptions
+    from appearance_opt.config import LodOptions, SimplifyOptions
     from appearance_opt.errors import DivergedError
     from appearance_opt.optimize.loop import FitResult
     from appearance_opt.reference.subject import Subject
@@ -61,6 +61,12 @@ class Level:
         """The level."""
         return self.exported.asset
 
+    @property
+    def drawn(self) -> Asset:
+        """It as it is seen: with a displacement map, the finest tessellated mesh."""
+        levels = self.exported.levels
+        return levels[max(levels)] if levels else self.asset
+
 
 def plan_shares(count: int) -> tuple[float, ...]:
     """Part of the time that each level may take, the finest first; they add up to 1.
@@ -98,6 +104,22 @@ def from_finer(subject: Subject, finer: Asset) -> Subject:
     return replace(subject, survey=survey)
 
 
+def fit_level(
+    made_from: Subject, source: Asset, options: SimplifyOptions, run: Run, pixels: int
+) -> Level:
+    """One mesh of ``options.start.triangles``, started from ``made_from`` and fitted to its images.
+    ``source``: what nodes, names and credits come from."""
+    began = run.watch.total
+    start, o = choose_start(made_from, None, options, run)
+    run.lap("start")
+    model, fitted, error = fit_start(made_from, start, o, run)
+    name = f"{source.name}_{len(start.mesh.faces)}"
+    exported = export(model, start, made_from, o, Exporter(made_from.placement, source, name))
+    run.lap("export")
+    took = run.watch.total - began
+    return Level(pixels, exported, fitted, start.notes, error, took)
+
+
 def fit_levels(
     subject: Subject,
     source: Asset,
@@ -130,17 +152,11 @@ def fit_levels(
             with_report=False,
         )
         made_from = subject if not out else from_finer(subject, out[-1].asset)
-        start, o = choose_start(made_from, None, o, level_run)
-        run.lap("start")
-        model, fitted, error = fit_start(made_from, start, o, level_run)
-        name = f"{source.name}_{len(start.mesh.faces)}"
-        exported = export(model, start, made_from, o, Exporter(subject.placement, source, name))
-        run.lap("export")
-        took = run.watch.total - began
-        out.append(Level(pixels, exported, fitted, start.notes, error, took))
-        if kept is not None and not fitted.interrupted:
+        level = fit_level(made_from, source, o, level_run, pixels)
+        out.append(level)
+        if kept is not None and not level.fit.interrupted:
             kept.finish(k)
-        left = None if left is None else max(left - took, 0.0)
+        left = None if left is None else max(left - (run.watch.total - began), 0.0)
     return out
 
 
@@ -155,21 +171,27 @@ class Finished:
 
 
 class KeptLevels:
-    """Checkpoints of a chain in ``folder``: one folder per level, and a file that says how many are
-    complete. ``fingerprint``, ``resume``, ``interval``: see ``Checkpointer``. Raises InputError for a
-    folder that holds anything else."""
+    """Checkpoints of several fits in ``folder``: one folder for each of ``count``, called ``name``
+    and its number, and a file that says how many are complete. ``fingerprint``, ``resume``,
+    ``interval``: see ``Checkpointer``. Raises InputError for a folder that holds anything else."""
 
     def __init__(
-        self, folder: Path, fingerprint: str, resume: bool, interval: float, count: int
+        self,
+        folder: Path,
+        fingerprint: str,
+        resume: bool,
+        interval: float,
+        count: int,
+        name: str = "level",
     ) -> None:
         self.folder, self._fingerprint, self._resume = folder, fingerprint, resume
-        self._interval, self.done = interval, 0
+        self._interval, self._name, self.done = interval, name, 0
         folder.mkdir(parents=True, exist_ok=True)
-        known = {CHAIN_FILE, *(f"level{k}" for k in range(count))}
+        known = {CHAIN_FILE, *(f"{name}{k}" for k in range(count))}
         for path in folder.iterdir():
             if path.name not in known and not path.name.startswith("."):
                 raise InputError(
-                    f"{folder}: holds '{path.name}', which is no checkpoint of this chain; choose "
+                    f"{folder}: holds '{path.name}', which is no checkpoint of this job; choose "
                     "an empty folder or a new one"
                 )
         path = folder / CHAIN_FILE
@@ -185,7 +207,7 @@ class KeptLevels:
 
     def checkpointer(self, level: int) -> Checkpointer:
         """Of one level. An unfinished level beyond the first unfinished one cannot exist."""
-        folder = self.folder / f"level{level}"
+        folder = self.folder / f"{self._name}{level}"
         resume = self._resume and level <= self.done
         return Checkpointer(folder, f"{self._fingerprint}-{level}", resume, self._interval)
 
