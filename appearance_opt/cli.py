@@ -179,6 +179,7 @@ def inspect(given: Given, as_json: Json = False) -> None:
 COMMANDS: dict[str, Callable[..., None]] = {
     "simplify": simplify,
     "lod": simplify,
+    "convert": simplify,
     "bake": bake,
     "compare": compare,
     "inspect": inspect,

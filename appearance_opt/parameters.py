@@ -35,7 +35,7 @@ INPUTS = {
     "INPUT": ".glb .gltf .usd* .obj .ply .stl",
     "HIGH": "What it shall look like.",
     "LOW": "Keeps its topology and its texture coordinates.",
-    "KIND": "What SOURCE is: sdf.",
+    "KIND": "What SOURCE is: sdf, scene, images or command.",
     "SOURCE": "What it shall look like.",
     "REFERENCE": "What it shall look like.",
     "CANDIDATE": "What is judged.",

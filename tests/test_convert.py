@@ -120,7 +120,10 @@ def test_the_command_line_refuses_in_one_line(ring: Path, tmp_path: Path) -> Non
         (("mesh", str(ring), "--triangles", "100"), "choose from sdf"),
         (("sdf", f"{ring}:other", "--triangles", "100"), "has no 'other'"),
         (("sdf", str(ring)), "give --triangles N"),
-        (("sdf", str(ring), "--triangles", "100", "--init", "decimate"), "marching-cubes, sphere"),
+        (
+            ("sdf", str(ring), "--triangles", "100", "--init", "decimate"),
+            "marching-cubes, hull, sphere",
+        ),
     ):
         done = run("convert", *arguments, "--out", out)
         assert done.returncode == 2 and words in done.stderr, done.stderr

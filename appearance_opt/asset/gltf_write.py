@@ -395,6 +395,10 @@ def _about(asset: Asset) -> dict[str, Any]:
         out["copyright"] = asset.credits.copyright
     if asset.credits.extras is not None:
         out["extras"] = asset.credits.extras
+    if asset.credits.lighting:
+        given = asset.credits.extras
+        others = given if isinstance(given, dict) else {} if given is None else {"source": given}
+        out["extras"] = {**others, "lighting": asset.credits.lighting}
     return out
 
 

@@ -43,6 +43,8 @@ def save_obj(asset: Asset, path: Path, options: FileOptions = PLAIN) -> None:
         mtl += _mtl_lines(replace(m, name=named[key]), path, options)
     path.with_suffix(".mtl").write_text("\n".join(mtl) + "\n", encoding="utf-8")
     lines = ["# appearance-opt", f"mtllib {path.stem}.mtl"]
+    if asset.credits.lighting:
+        lines.insert(1, f"# lighting: {asset.credits.lighting}")
     if asset.credits.copyright:
         lines.insert(1, f"# copyright: {' '.join(asset.credits.copyright.split())}")
     start = np.ones(

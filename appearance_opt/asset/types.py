@@ -178,10 +178,12 @@ class Node:
 @dataclass(frozen=True)
 class Credits:
     """What a file says of itself. ``copyright``: the line that its owners ask to be shown;
-    ``extras``: other values of its authors (JSON), or None."""
+    ``extras``: other values of its authors (JSON), or None; ``lighting``: what light its colours
+    hold, if they hold any."""
 
     copyright: str = ""
     extras: Any = None
+    lighting: str = ""
 
 
 @dataclass(frozen=True)

@@ -82,8 +82,9 @@ def _write_stage(levels: Sequence[Asset], root: Path, textures: str, options: Fi
     top = kind.Define(stage, f"/{name}")
     stage.SetDefaultPrim(top.GetPrim())
     Usd.ModelAPI(top.GetPrim()).SetKind(Kind.Tokens.component)
-    if asset.credits.copyright:
-        stage.GetRootLayer().customLayerData = {COPYRIGHT: asset.credits.copyright}
+    said = {COPYRIGHT: asset.credits.copyright, "lighting": asset.credits.lighting}
+    if any(said.values()):
+        stage.GetRootLayer().customLayerData = {k: v for k, v in said.items() if v}
     UsdGeom.Scope.Define(stage, f"/{name}/Materials")
     materials = _Materials(stage, f"/{name}/Materials", root.parent / textures, options)
     for level in levels:  # outside of the variants, so that all of them share one texture set

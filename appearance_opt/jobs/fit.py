@@ -16,11 +16,9 @@ from appearance_opt.errors import InputError
 from appearance_opt.jobs.lifecycle import close_run, load_layout, name_of, open_run, write_levels
 from appearance_opt.jobs.paths import Outputs
 from appearance_opt.jobs.result import SimplifyResult
-from appearance_opt.reference.mesh import MeshReference
 from appearance_opt.reference.subject import Subject
-from appearance_opt.reference.survey import MeshSurvey
 from appearance_opt.stages.choice import choose_start
-from appearance_opt.stages.export import Exporter, export
+from appearance_opt.stages.export import Exporter, export, with_lighting
 from appearance_opt.stages.fitting import fit_start
 from appearance_opt.stages.parts import Parts, split
 from appearance_opt.stages.start import localize
@@ -119,11 +117,11 @@ def _fit(
     if parts is not None:
         like, notes = parts.fitted, parts.fitted.notes
         mesh = localize(movable(prepare(like).mesh), placement, like.origin)
-        survey = MeshSurvey(MeshReference(placement.local(parts.fitted)))
-        subject = replace(subject, survey=survey)
+        subject = subject.with_likeness(parts.fitted)
     start, left = choose_start(subject, mesh, options, run)
     run.lap("start")
     model, fitted, error = fit_start(subject, start, left, run)
+    like = with_lighting(like, subject)
     exported = export(model, start, subject, left, Exporter(placement, like, like.name))
     run.lap("export")
     parts = Parts(exported.asset) if parts is None else parts

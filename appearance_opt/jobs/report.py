@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,6 +18,7 @@ from appearance_opt.evaluate.showing import Looks, picture_upright, show
 from appearance_opt.evaluate.sizes import sizes_of
 from appearance_opt.evaluate.verdict import at_sizes
 from appearance_opt.options.option import entries, flag_name
+from appearance_opt.reference.album import Album
 from appearance_opt.reference.mesh import MeshReference
 from appearance_opt.views import support
 
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
     from appearance_opt.jobs.result import Result
     from appearance_opt.options.option import Record
     from appearance_opt.placement import Placement
+    from appearance_opt.reference.base import Reference
     from appearance_opt.reference.subject import Subject
 
 LOOKS = Looks()
@@ -60,7 +62,7 @@ def write_job_report(
         {name: subject.placement.local(a) for name, a in result.columns.items()},
         subject.placement.local(result.asset),
         subject.sampler,
-        LOOKS,
+        looks_at(subject.reference),
     )
     curve = [] if result.fit is None else result.fit.curve
     sizes = {"result": sizes_of(result.asset, result.files)}
@@ -82,6 +84,14 @@ def write_job_report(
         **{f.name: getattr(shown, f.name) for f in fields(shown)},
     )
     write_report(folder, data)
+
+
+def looks_at(reference: Reference) -> Looks:
+    """How finely a report looks: where images take long, no finer than those that are kept."""
+    if not isinstance(reference, Album):
+        return LOOKS
+    size = min(reference.resolution, LOOKS.resolution)
+    return replace(LOOKS, resolution=size, pictured=size)
 
 
 def write_compare_report(

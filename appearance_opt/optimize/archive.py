@@ -27,7 +27,10 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 STATE_FILE, START_FILE = "fit.npz", "start.npz"
-FILES = (STATE_FILE, START_FILE)
+IMAGES = "images"
+"""Folder of images that took long."""
+
+FILES = (STATE_FILE, START_FILE, IMAGES)
 """What a folder of checkpoints holds: the state of the fit, and the start that it belongs to."""
 
 HEAD, SUFFIX, TEMPORARY = "archive.json", ".npy", ".tmp"

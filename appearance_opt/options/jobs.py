@@ -16,6 +16,7 @@ from appearance_opt.options.maps import DisplacementOptions, TextureOptions
 from appearance_opt.options.option import Record, option, part, require
 from appearance_opt.options.parts import PartOptions
 from appearance_opt.options.reading import AssetOptions
+from appearance_opt.options.source import SourceOptions
 from appearance_opt.options.start import ConvertStartOptions, StartOptions
 from appearance_opt.options.views import ViewOptions
 
@@ -112,6 +113,7 @@ class ConvertOptions(SimplifyOptions):
         ConvertStartOptions, without=("ratio", "max_error", "pixels", "strict")
     )
     parts: PartOptions = part(PartOptions, only=())
+    source: SourceOptions = part(SourceOptions)
 
 
 @dataclass(frozen=True)
@@ -218,7 +220,8 @@ JOBS: dict[str, Job] = {
     ),
     "convert": Job(
         "Write a textured mesh of what is none. KIND says what SOURCE is: sdf (a distance field: "
-        "FILE.py:NAME, whose code is run, or a grid in FILE.npz).",
+        "FILE.py:NAME, whose code is run, or a grid in FILE.npz), scene (of Mitsuba: FILE.xml), "
+        "images (FOLDER or its transforms.json), command (a program that renders; it is run).",
         ConvertOptions,
         ("KIND", "SOURCE"),
     ),

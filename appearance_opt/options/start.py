@@ -80,13 +80,14 @@ class StartOptions(Record):
 class ConvertStartOptions(StartOptions):
     """The same for what is no mesh: its first shape is found, or fitted."""
 
-    INITS: ClassVar[tuple[str, ...]] = ("marching-cubes", "sphere")
+    INITS: ClassVar[tuple[str, ...]] = ("auto", "marching-cubes", "hull", "sphere")
 
     init: str = option(
-        "marching-cubes",
-        "marching-cubes (of a shape that can be asked), sphere, or a file to start from.",
+        "auto",
+        "marching-cubes (of a shape that can be asked), hull (what silhouettes leave), sphere, or "
+        "a file to start from; auto: the first of them that the source allows.",
         panel="Start",
-        metavar="marching-cubes|sphere|FILE",
+        metavar="auto|marching-cubes|hull|sphere|FILE",
     )
 
     def __post_init__(self) -> None:

@@ -42,7 +42,7 @@ class ReferencePool:
     """At most ``capacity`` views drawn from ``sampler`` at a time, their images rendered when first
     asked for.
 
-    The first iterations see new views, ``FIRST`` batches of them. From then on every ``reuse``-th
+    The first iterations see new views, ``first`` batches of them. From then on every ``reuse``-th
     iteration does, and its views take the place of the oldest ones as soon as ``capacity`` is
     reached; the others draw at random from those that are there. So each view is seen about
     ``reuse`` times: enough to spare most of the rendering, and few enough that maps of a million
@@ -61,6 +61,7 @@ class ReferencePool:
     samples: int
     point_width: float = 0.4
     reuse: int = 0
+    first: int = FIRST
     _images: dict[int, NDArray[np.float16]] = field(default_factory=dict)
     _points: dict[int, NDArray[np.float16]] = field(default_factory=dict)
     _views: dict[int, Views] = field(default_factory=dict)
@@ -107,7 +108,7 @@ class ReferencePool:
 
     def _newest(self, iteration: int) -> tuple[int, bool]:
         """(number of the newest batch, does the iteration see that one?)"""
-        first = self._groups if self.reuse == 0 else min(FIRST, self._groups)
+        first = self._groups if self.reuse == 0 else min(self.first, self._groups)
         later = iteration - first
         if later < 0:
             return iteration, True

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import product
 from typing import TYPE_CHECKING
 
@@ -78,6 +78,14 @@ class Subject:
         )
         reference = PlacedReference(Boxed(pictures, bounds), placement)
         return cls(reference, listed, placement, static_light=pictures.static_light)
+
+    def with_likeness(self, asset: Asset) -> Subject:
+        """The same, with what is known of the surface taken from ``asset`` in the world; unlit
+        where the light stands still."""
+        if self.static_light:
+            plain = (replace(m, material=replace(m.material, unlit=True)) for m in asset.meshes)
+            asset = replace(asset, meshes=tuple(plain))
+        return replace(self, survey=MeshSurvey(MeshReference(self.placement.local(asset))))
 
     @property
     def unlit(self) -> bool:

@@ -45,7 +45,7 @@ def choose_start(
     elif o.start.init == "sphere" and alone:
         count = budget(o, available)
         start, o = _fit_shape(lambda effort: grow_start(subject, options, count, effort), o, run)
-    elif o.start.init == "hull":
+    elif o.start.init == "hull" or (o.start.init == "auto" and survey is None):
         count = budget(o, available)
         grow = partial(grow_start, subject, options, count, hull=True)
         start, o = _fit_shape(grow, o, run)

@@ -29,6 +29,10 @@ if TYPE_CHECKING:
     from appearance_opt.stages.start import Start
 
 
+BAKED = "baked into the base colours, with shadows and reflections: that of the reference"
+"""What a file says of its light where that of the reference stands still."""
+
+
 @dataclass(frozen=True)
 class Exported:
     """``asset``: what was fitted; ``start``: the same before the fit, as it was drawn; ``levels``:
@@ -52,6 +56,13 @@ def export(
     maps = flatten_maps(model, maps, start, subject, options)
     levels = exporter.drawn(model, maps) if options.displacement.fitted else {}
     return Exported(exporter.base(model, maps), begin, levels)
+
+
+def with_lighting(like: Asset, subject: Subject) -> Asset:
+    """What a result takes its credits from, which say what light is baked in, if any is."""
+    if not subject.static_light:
+        return like
+    return replace(like, credits=replace(like.credits, lighting=BAKED))
 
 
 class Exporter:

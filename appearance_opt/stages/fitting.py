@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -18,15 +19,18 @@ from appearance_opt.latent.texels import Texels
 from appearance_opt.optimize.loop import FitResult, Judge, fit
 from appearance_opt.optimize.plan import FitOptions
 from appearance_opt.optimize.validation import Validation
-from appearance_opt.reference.pool import ReferencePool
+from appearance_opt.reference.album import Album
+from appearance_opt.reference.pool import FIRST, ReferencePool
 from appearance_opt.render.boundary.camera_rays import CameraRays
 from appearance_opt.render.quality import Quality
+from appearance_opt.stages.run import REPORT_SECONDS
 from appearance_opt.views import VALIDATION
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from appearance_opt.config import CommonOptions
+    from appearance_opt.reference.base import Reference
     from appearance_opt.reference.subject import Subject
     from appearance_opt.stages.run import Run
     from appearance_opt.stages.start import Start
@@ -35,6 +39,18 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 VALIDATION_VIEWS = 8
+
+STEP = 0.1
+"""About the seconds of a step of 4 views of 256 pixels."""
+
+REPORT_VIEWS = 9
+"""Images that a report looks at."""
+
+FEWEST = 2
+"""Batches that a fit to slow images begins with, at least."""
+
+MOST_KEPT = 512
+"""Views of which it is asked whether their images are there."""
 
 POOL_SAMPLES = 8
 """Rays per pixel of the reference's images where outlines pass. More views with fewer rays are
@@ -70,7 +86,7 @@ def fit_start(
         o.views.resolution,
         POOL_SAMPLES,
         width,
-        o.views.reuse,
+        *paced(reference, sampler, o.views.reuse, o.views.per_step, o.views.resolution, run),
     )
     held_out = sampler.held_out(VALIDATION).draw(0, VALIDATION_VIEWS)
     validation = Validation(reference, held_out, min(o.views.resolution, 256))
@@ -131,6 +147,23 @@ def fit_latent(
         error, fitted = diverged, FitResult()
     run.lap("fit")
     return fitted, error
+
+
+def paced(
+    reference: Reference, sampler: Sampler, reuse: int, batch: int, resolution: int, run: Run
+) -> tuple[int, int]:
+    """(how often each view is seen, batches that are new at the beginning) of a pool. Where a time
+    budget runs, slow images (see ``Album``) are seen more often, so that rendering takes no longer
+    than fitting; the fit begins with those that are there."""
+    if not isinstance(reference, Album) or run.budget is None:
+        return reuse, FIRST
+    run.report_seconds = REPORT_SECONDS + REPORT_VIEWS * reference.seconds
+    step = STEP * batch / 4 * (resolution / 256) ** 2
+    wanted = math.ceil(reference.seconds * batch / step)
+    if wanted <= reuse:
+        return reuse, FIRST
+    there = reference.has(sampler.draw(0, MOST_KEPT))
+    return wanted, max(there // batch, FEWEST)
 
 
 def pool_size(sampler: Sampler, wanted: int, batch: int) -> int:

@@ -34,7 +34,7 @@ from appearance_opt.reference.mesh import MeshReference
 from appearance_opt.reference.pool import ReferencePool
 from appearance_opt.reference.survey import MeshSurvey
 from appearance_opt.stages.displacement import flat_map
-from appearance_opt.stages.fitting import VALIDATION_VIEWS, clean_maps, pool_size
+from appearance_opt.stages.fitting import VALIDATION_VIEWS, clean_maps, paced, pool_size
 from appearance_opt.stages.hull import hull_mesh
 from appearance_opt.stages.run import Run
 from appearance_opt.stages.start import (
@@ -195,7 +195,7 @@ def _fit_shape(
         RESOLUTION,
         POOL_SAMPLES,
         POINT_WIDTH,
-        options.views.reuse,
+        *paced(reference, sampler, options.views.reuse, VIEWS, RESOLUTION, effort.run),
     )
     validation = Validation(
         reference, sampler.held_out(VALIDATION).draw(0, VALIDATION_VIEWS), RESOLUTION

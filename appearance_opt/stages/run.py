@@ -45,7 +45,8 @@ class Stopwatch:
 @dataclass
 class Run:
     """``budget``: seconds for all of the job, None without a limit; ``with_report``: will a report
-    be made in that time, too? ``checkpointer``: None if the state of the fit is not kept."""
+    be made in that time, too, which takes ``report_seconds``? ``checkpointer``:
+    None if the state of the fit is not kept."""
 
     watch: Stopwatch = field(default_factory=Stopwatch)
     budget: float | None = None
@@ -53,6 +54,7 @@ class Run:
     interrupts: Interrupts = field(default_factory=Interrupts)
     checkpointer: Checkpointer | None = None
     with_report: bool = False
+    report_seconds: float = REPORT_SECONDS
 
     def begin(self, text: str) -> None:
         """Say what begins, in a few words."""
@@ -67,7 +69,7 @@ class Run:
         """Seconds of the budget that are left for start and fit; None without a budget."""
         if self.budget is None:
             return None
-        reserve = EXPORT_SECONDS + (REPORT_SECONDS if self.with_report else 0.0)
+        reserve = EXPORT_SECONDS + (self.report_seconds if self.with_report else 0.0)
         return max(self.budget - self.watch.total - reserve, 0.0)
 
     def observers(self, *, resumable: bool = True) -> list[Observer]:

@@ -92,7 +92,7 @@ def require_survey(subject: Subject) -> Survey:
     """The surface of a subject. Raises InputError if only images are known of it."""
     if subject.survey is None:
         raise InputError(
-            "images are all that is known of this reference: start from a mesh or a sphere"
+            "images are all that is known of this reference: start from its hull, a sphere, or a file"
         )
     return subject.survey
 
