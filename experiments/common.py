@@ -23,6 +23,9 @@ JUDGE = ROOT.parent / "shared" / "judge"
 
 OUT = ROOT / "out"
 
+EMBEDDED = ("relic", "creature")
+"""Scenes of this repository, which are built when they are first asked for."""
+
 
 class Missing(SystemExit):
     """A file that an experiment needs is not there: ends the program with one line, unless it is
@@ -37,7 +40,7 @@ def asset(name: str) -> Path:
 def source_of(name: str) -> Path:
     """The heavy GLB of that name; the embedded scene is built when it is first asked for. Raises
     Missing."""
-    if name != "relic":
+    if name not in EMBEDDED:
         return _there(JUDGE / "references" / f"{name}.glb")
     path = OUT / "scenes" / f"{name}.glb"
     if not path.exists():
