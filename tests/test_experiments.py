@@ -12,7 +12,11 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-FOREIGN = {"experiments.baking.blender_bake", "experiments.quality.blender_simplify"}
+FOREIGN = {
+    "experiments.baking.blender_bake",
+    "experiments.engines.blender_views",
+    "experiments.quality.blender_simplify",
+}
 """Run in Blender's own Python."""
 
 FILES = {
