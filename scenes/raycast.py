@@ -1,7 +1,7 @@
 """A renderer in forty lines of NumPy, for `appearance-opt convert command 'python
 scenes/raycast.py' --triangles 1000 --out balls.glb`: three matt balls under a lamp.
 
-The protocol is told in docs/conversion.md."""
+The protocol is told in docs/black_boxes.md."""
 
 import json
 import sys

@@ -7,13 +7,16 @@ import textwrap
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import drjit as dr
 import numpy as np
 import pytest
 
+from appearance_opt import backend
 from appearance_opt.asset.images import encode_exr
 from appearance_opt.errors import InputError, ReferenceRenderError
 from appearance_opt.reference import command
 from appearance_opt.reference.command import CommandReference
+from appearance_opt.reference.plugins import MINIMUM_LLVM
 from appearance_opt.views import look_at
 
 if TYPE_CHECKING:
@@ -144,3 +147,23 @@ def test_the_ray_caster_of_the_docs_draws_its_balls() -> None:
         np.testing.assert_allclose(image[16, 16], [0.1, 0.5, 0.8, 1], rtol=0.01)
         assert reference.bounds[0] == pytest.approx([-1.2, -0.6, -0.6])
         assert 0 < image[..., 3].mean() < 1 and not reference.static_light
+
+
+def test_mitsuba_in_another_process(tmp_path: Path, variant: str) -> None:
+    """A white ball under an even sky of radiance 0.5, whose reflectance is Mitsuba's default."""
+    if variant == backend.CPU and dr.detail.llvm_version()[0] < MINIMUM_LLVM:
+        pytest.skip("Mitsuba's plugins need a newer LLVM")
+    scene = tmp_path / "ball.xml"
+    scene.write_text(
+        '<scene version="3.0.0"><shape type="sphere"/><emitter type="constant">'
+        '<rgb name="radiance" value="0.5"/></emitter></scene>'
+    )
+    eye = np.array([[0.0, 0.0, 8.0]])
+    view = look_at(eye, np.zeros(3), 20.0, eye, 1.0)
+    words = [sys.executable, str(RAYCAST.with_name("mitsuba_program.py")), str(scene), "scalar"]
+    with CommandReference(words) as reference:
+        assert reference.static_light
+        np.testing.assert_allclose(reference.bounds, [[-1] * 3, [1] * 3], atol=1e-6)
+        image = reference.render(view, 12)[0]
+    np.testing.assert_allclose(image[5:7, 5:7].mean(axis=(0, 1)), [0.25, 0.25, 0.25, 1], rtol=0.05)
+    assert image[0, 0].max() == 0

@@ -91,9 +91,11 @@ def undocumented(kind: type, *pages: str) -> list[str]:
 def test_every_option_is_documented() -> None:
     from appearance_opt.config import BakeOptions, JointOptions, SimplifyOptions
     from appearance_opt.options.baking import MAPS
+    from appearance_opt.options.source import SourceOptions
 
     assert not undocumented(SimplifyOptions, "usage", "files")
     assert not undocumented(BakeOptions, "baking", "files")
     assert not undocumented(JointOptions, "baking", "files")
+    assert not undocumented(SourceOptions, "black_boxes")
     text = (ROOT / "docs" / "baking.md").read_text(encoding="utf-8")
     assert not [n for n in MAPS if f"`{n}`" not in text]

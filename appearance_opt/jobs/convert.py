@@ -42,6 +42,7 @@ OPENERS = {
     "scene": ("appearance_opt.reference.image_open", "open_scene"),
     "images": ("appearance_opt.reference.image_open", "open_pictures"),
     "command": ("appearance_opt.reference.image_open", "open_command"),
+    "reference": ("appearance_opt.reference.image_open", "open_reference"),
 }
 """Kinds of sources: the module, and in it the function of (source, options) that makes an
 ``Opened`` of one. It is imported when a source of its kind is asked for."""
@@ -66,7 +67,9 @@ def convert(
     ``kind``: a key of ``OPENERS``: "sdf" takes "FILE.py:NAME", "FILE.npz", or in Python an object
     with ``distance``, ``bounds`` and perhaps ``material`` (see ``sdf.shape.Shape``). Code is run
     only from the file that is named here. "scene" takes a Mitsuba scene, "images" a transforms.json
-    beside its pictures, "command" a program that renders (see ``reference.command``). ``checkpoint``:
+    beside its pictures, "command" a program that renders (see ``reference.command``),
+    "reference" an object with ``bounds`` and ``render`` (see ``Reference``), whose images are kept,
+    for they may take long. ``checkpoint``:
     folder in which the state is kept every few seconds, and images that took long; with ``resume``
     a run goes on from there. ``values``: options by flat key, instead of ``options``
     or over them. ``inputs``: other files that must not be replaced. Raises AppearanceError.

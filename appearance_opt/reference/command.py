@@ -1,6 +1,6 @@
 """Another program as a reference: views go to it as JSON lines, images come back as files.
 
-The protocol (docs/conversion.md tells it to those who write such a program). Every message is one
+The protocol (docs/black_boxes.md tells it to those who write such a program). Every message is one
 line of JSON. The program is started once, and ends when its input does.
 
 1. ``{"protocol": 1, "folder": "/tmp/..."}`` -> ``{"bounds": [[x, y, z], [x, y, z]], "light":

@@ -1,6 +1,6 @@
 """A folder of pictures as a reference: ``transforms.json`` in the manner of NeRF, and its images.
 
-docs/conversion.md tells what the file may hold.
+docs/black_boxes.md tells what the file may hold.
 """
 
 from __future__ import annotations

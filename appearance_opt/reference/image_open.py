@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from appearance_opt.errors import InputError
+from appearance_opt.reference.base import PointReference
 from appearance_opt.reference.command import CommandReference
 from appearance_opt.reference.folder import FolderReference
 from appearance_opt.reference.opened import Opened
@@ -63,6 +64,18 @@ def open_command(source: Any, options: ConvertOptions) -> Opened:
         reference.close()
         raise
     return _opened(subject, "command", (), options, slow=True, close=reference.close)
+
+
+def open_reference(source: Any, options: ConvertOptions) -> Opened:
+    """An object with ``bounds`` and ``render``. Raises InputError."""
+    if not hasattr(source, "bounds") or not hasattr(source, "render"):
+        raise InputError(
+            f"{type(source).__name__}: is no reference, which has bounds and "
+            "render(views, resolution, samples); it is an object in Python"
+        )
+    subject = Subject.of_reference(source, options.views.seed, options.views.light)
+    slow = not isinstance(source, PointReference)
+    return _opened(subject, type(source).__name__.lower(), (), options, slow)
 
 
 def _opened(
