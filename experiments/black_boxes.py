@@ -43,7 +43,9 @@ if TYPE_CHECKING:
 OUT = RESULTS / "black_boxes"
 ROWS = ("slow", "pictures", "live", "paths")
 VIEWS, SIZE, PATHS = 8, 256, 32
-PICTURES, PICTURE_SIZE = 100, 400
+PICTURES = 100
+"""Their sides are half again as many pixels as the views of the fit have: views are framed to the
+silhouettes, pictures to a sphere."""
 
 
 class Waiting:
@@ -79,9 +81,9 @@ def measure(row: str, options: dict[str, Any], cpu_clock: bool) -> dict[str, Any
     asset = ao.load(source_of("relic"))
     live = Waiting(asset, 1.0 if row == "slow" else 0.0)
     if row == "pictures":
-        folder = OUT / "shots"
+        folder = OUT / f"shots{options['resolution']}"
         if not (folder / "transforms.json").exists():
-            shoot(live, folder, PICTURES, PICTURE_SIZE, "point")
+            shoot(live, folder, PICTURES, options["resolution"] * 3 // 2, "point")
         result = ao.convert("images", folder, OUT / f"{row}.glb", **options)
     else:
         if cpu_clock:

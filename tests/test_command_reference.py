@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import signal
+import subprocess
 import sys
 import textwrap
 from pathlib import Path
@@ -167,3 +170,28 @@ def test_mitsuba_in_another_process(tmp_path: Path, variant: str) -> None:
         image = reference.render(view, 12)[0]
     np.testing.assert_allclose(image[5:7, 5:7].mean(axis=(0, 1)), [0.25, 0.25, 0.25, 1], rtol=0.05)
     assert image[0, 0].max() == 0
+
+
+HOLDER = """
+import sys, time
+from appearance_opt.reference.command import CommandReference
+reference = CommandReference(sys.argv[1:])
+print(reference._process.pid, reference._folder, flush=True)
+time.sleep(600)
+"""
+
+
+def test_a_program_ends_when_its_user_does(tmp_path: Path) -> None:
+    """A Ctrl-C ends the job; the program, which it does not reach, ends with it."""
+    words = [sys.executable, "-c", HOLDER, sys.executable, str(RAYCAST)]
+    with subprocess.Popen(
+        words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=RAYCAST.parents[1]
+    ) as holder:
+        assert holder.stdout is not None
+        process, folder = holder.stdout.readline().split()
+        assert Path(folder).is_dir()
+        holder.send_signal(signal.SIGINT)
+        holder.communicate()
+    assert not Path(folder).exists()
+    with pytest.raises(ProcessLookupError):
+        os.kill(int(process), 0)

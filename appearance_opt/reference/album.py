@@ -23,6 +23,10 @@ if TYPE_CHECKING:
 BLOCK = 8
 """Views of a ``Numbered`` sampler that are drawn at a time."""
 
+SAMPLES = 9
+"""Rays per pixel of images that are kept, at least: the first stage that sees a view may need
+fewer than the last."""
+
 MOST = 2 << 30
 """Bytes of images that are kept in memory; later ones are rendered whenever they are asked for."""
 
@@ -68,7 +72,7 @@ class Album:
         missing = [k for k, key in enumerate(keys) if key not in images]
         # one by one: each is kept at once, whatever becomes of the next
         for k in missing:
-            image = self._rendered_now(views[k : k + 1], self.resolution, samples)[0]
+            image = self._rendered_now(views[k : k + 1], self.resolution, max(samples, SAMPLES))[0]
             images[keys[k]] = self._keep(keys[k], image)
         shrink = averaging(self.resolution, resolution)
         return np.stack([_shrunk(images[key].astype(np.float32), shrink) for key in keys])

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from appearance_opt.latent.mesh import LatentMesh
     from appearance_opt.reference.subject import Subject
 
-VIEWS, RESOLUTION, SAMPLES = 32, 192, 4
+VIEWS, RESOLUTION, SAMPLES = 24, 192, 4
 """Of the silhouettes; of a list of views all are taken."""
 
 CELLS = 64
