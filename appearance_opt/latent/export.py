@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
@@ -16,6 +16,8 @@ from appearance_opt.asset.normals import (
 from appearance_opt.asset.packing import EMISSION, pack_emission
 from appearance_opt.asset.tangents import split_and_tangents
 from appearance_opt.asset.types import Asset, Material, Mesh, Texture
+from appearance_opt.initial.fill import fill
+from appearance_opt.latent.texels import OPACITY
 from appearance_opt.render.material import DEFAULTS, UNLIT
 
 if TYPE_CHECKING:
@@ -33,12 +35,14 @@ def to_asset(
     maps: Mapping[str, NDArray | float],
     name: str,
     skin: Skin | None = None,
+    alpha: Literal["mask", "blend"] = "blend",
 ) -> Asset:
     """One mesh for each node that faces belong to, and one material; two, with the same textures,
     where some faces are seen from both sides and others from their front only. ``positions`` (V,
     3); ``maps``: natural values by channel name, images or numbers. Normals are angle weighted and
     tangents MikkTSpace's: what the renderer of the fit uses, so that the maps mean the same in
-    another one. ``skin``: of the welded vertices."""
+    another one. ``skin``: of the welded vertices. ``alpha``: how an opacity among the maps is
+    written; with "mask" the surface is there where it reaches the ``coverage_cutoff``."""
     p, tangents = positions[mesh.frame_vertex], None
     normals = shading_normals(mesh, positions)[mesh.frame_normal]
     index, faces, n = split_where_cancelled(p, mesh.frame_faces, normals)
@@ -52,7 +56,7 @@ def to_asset(
         normals=n,
         uvs=uv,
         tangents=tangents,
-        material=_material(maps, name),
+        material=_material(maps, name, alpha),
         name=name,
         skin=None if skin is None else skin.take(vertex),
     )
@@ -105,7 +109,16 @@ def _part(mesh: Mesh, faces: NDArray) -> Mesh:
     return mesh.take(used, corners.reshape(-1, 3))
 
 
-def _material(maps: Mapping[str, NDArray | float], name: str) -> Material:
+def coverage_cutoff(opacity: NDArray[np.float32]) -> float:
+    """The cutoff at which as many texels pass the test as their opacities (H, W) amount to, so that
+    what is cut out covers as much as what is blended (Castano 2010). At least a step of eight
+    bits: what is not there at all never passes."""
+    return max(float(np.quantile(opacity, 1 - float(opacity.mean()))), 1 / 255)
+
+
+def _material(
+    maps: Mapping[str, NDArray | float], name: str, alpha: Literal["mask", "blend"]
+) -> Material:
     def stacked(*names: str) -> NDArray | None:
         values = [np.asarray(maps.get(n, 0.0), np.float32) for n in names]
         shapes = [v.shape for v in values if v.ndim]
@@ -135,19 +148,33 @@ def _material(maps: Mapping[str, NDArray | float], name: str) -> Material:
         pack_emission(emitted) if emitted is not None else (numbers(*EMISSION), None)
     )
     color = tuple(constant(c) if base is None else 1.0 for c in ("red", "green", "blue"))
+    kept_back = stacked(OPACITY)
+    pixels = None if base is None else _srgb8(base)
+    if kept_back is not None:
+        pixels = _with_alpha(base, kept_back)
     clamp = ("clamp", "clamp")
     return Material(
         name=name,
         base_color=color,  # type: ignore[arg-type]
         roughness=1.0 if orm is not None else constant("roughness"),
         metalness=1.0 if orm is not None else constant("metalness"),
-        base_color_texture=None if base is None else Texture(_srgb8(base), "srgb", clamp),  # type: ignore[arg-type]
+        base_color_texture=None if pixels is None else Texture(pixels, "srgb", clamp),  # type: ignore[arg-type]
         orm_texture=None if orm is None else Texture(_8(orm), "linear", clamp),  # type: ignore[arg-type]
         normal_texture=None if normal is None else Texture(_8(normal * 0.5 + 0.5), "linear", clamp),  # type: ignore[arg-type]
+        alpha_mode="opaque" if kept_back is None else alpha,
+        alpha_cutoff=0.5 if kept_back is None else coverage_cutoff(kept_back),
         unlit=UNLIT in maps,
         emission=emission,
         emission_texture=emission_texture,
     )
+
+
+def _with_alpha(base: NDArray | None, opacity: NDArray) -> NDArray[np.uint8]:
+    """RGBA of eight bits. Under an alpha of 0 lie the colours around: filters and mip levels of
+    engines mix them in."""
+    alpha = _8(opacity)
+    color = np.ones((*opacity.shape[:2], 3), np.float32) if base is None else base
+    return np.concatenate([_srgb8(fill(color, alpha[..., 0] > 0)), alpha], axis=-1)
 
 
 def _8(x: NDArray) -> NDArray[np.uint8]:

@@ -62,6 +62,9 @@ DISPLACEMENT_RATE = 4.0
 the finest edge, which is an eighth of the base edge at level 3."""
 
 
+OPACITY_RATE = 2.0
+"""Rate of opacity in units of that of the base colour, which is bounded alike."""
+
 WEIGHT_RATE = 5.0
 """Rate of skinning weights, in logarithms of them, in units of that of the normal map."""
 
@@ -119,7 +122,10 @@ def fit_latent(
     )
     defaults = (rates.position, rates.normal, rates.base_color, rates.material, rates.displacement)
     chosen = (d if g is None else g for g, d in zip(given, defaults, strict=True))
-    model.set_rates(replace(Rates(*chosen), weight=WEIGHT_RATE * rates.normal))
+    some = Rates(*chosen)
+    model.set_rates(
+        replace(some, weight=WEIGHT_RATE * rates.normal, opacity=OPACITY_RATE * some.base_color)
+    )
     run.lap("set-up")
     left = run.seconds_left()
     seconds = None if left is None else share * left

@@ -86,7 +86,7 @@ class Peeled(Estimator):
             weights.append(dr.full(mi.Float, 1 / count, dr.width(ray)))
         every, weight = concat(parts), join_arrays(weights)
         dr.eval(every, weight)
-        layers = self._peel(drawn, batch, every, dr.sqrt(weight) * width, run)
+        layers = self._peel(drawn, batch, every, dr.sqrt(weight) * width, run, beyond=True)
         colors, backs = blend(layers, dr.width(weight))
         image = dr.zeros(mi.Float, grid.pixels * 4)
         pixel = pixel_index(every, grid.rows)
@@ -149,18 +149,23 @@ class Peeled(Estimator):
         return points
 
     def _peel(
-        self, drawn: Drawn, batch: Batch, every: Samples, width: mi.Float, run: Run
+        self,
+        drawn: Drawn,
+        batch: Batch,
+        every: Samples,
+        width: mi.Float,
+        run: Run,
+        beyond: bool = False,
     ) -> list[Layer]:
         """Follow the rays of ``every`` sample (its triangle means nothing) through the layers;
-        ``width``: of each ray's footprint in pixels."""
+        ``width``: of each ray's footprint in pixels. ``beyond``: also behind what hides all others,
+        for they would be seen if it did not, and so its opacity has a derivative."""
         seen = run(_first, drawn.scene, batch, every)
         dr.eval(seen)
         index = dr.compress(seen.hit)
         ray, before = index, index
         light = dr.full(mi.Float, 1, dr.width(index))
-        # the light that would be there without the layer that keeps back most: on it depends how
-        # much a layer that hides all others would show of them if it did not
-        spare = light
+        spare = light  # what would be left without the layer that keeps back most
         out: list[Layer] = []
         while dr.width(index):
             seen, wide = seen.keep(index), dr.gather(mi.Float, width, ray)
@@ -172,7 +177,7 @@ class Peeled(Estimator):
                 break
             spare = spare * (1 - alpha)
             spare, light = dr.select(spare > light, spare, light), light * (1 - alpha)
-            on = dr.compress(spare >= LEAST)
+            on = dr.compress((spare if beyond else light) >= LEAST)
             if dr.width(on) == 0:
                 break
             seen = seen.keep(on)
