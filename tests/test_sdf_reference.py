@@ -132,6 +132,26 @@ def test_isosurfaces_lie_on_the_surface_and_wind_outward(distance: Callable, vol
                                      return_counts=True)[1])[[1]].any()  # fmt: skip
 
 
+def test_edges_and_corners_are_not_cut_off() -> None:
+    distance = lambda p: sdf.box(sdf.rotate(p, (1, 2, 3), 30.0), (0.5, 0.4, 0.3))  # noqa: E731
+    p, f = isosurface(distance, np.array(AROUND), 6000)
+    q = p[f].astype(np.float64)
+    cross = np.cross(q[:, 1] - q[:, 0], q[:, 2] - q[:, 0])
+    # the whole of its faces, which cut edges would lack
+    assert np.linalg.norm(cross, axis=1).sum() / 2 == pytest.approx(8 * 0.47, rel=2e-3)
+    assert np.einsum("ij,ij->i", q[:, 0], np.cross(q[:, 1], q[:, 2])).sum() / 6 == pytest.approx(
+        0.48, rel=1e-3
+    )
+    corners = np.abs(at_rest(p)) - (0.5, 0.4, 0.3)
+    assert np.linalg.norm(corners, axis=1).min() < 2e-3
+
+
+def at_rest(p: np.ndarray) -> np.ndarray:
+    """Points of that box, turned back."""
+    turned = sdf.rotate(mi.Point3f(np.ascontiguousarray(p.T)), (1, 2, 3), 30.0)
+    return np.array(turned).T
+
+
 def test_good_fields_are_taken_as_they_are() -> None:
     for distance in (BALL.distance, lambda p: sdf.torus(p, 0.6, 0.01)):
         found = check(placed(Shape(distance, AROUND)), "it")
