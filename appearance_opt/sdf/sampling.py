@@ -62,7 +62,8 @@ def isosurface(
 ) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
     """(positions (V, 3), faces (F, 3), counterclockwise from outside) of the surface in a box, of
     about so many triangles: marching cubes (scikit-image), whose vertices Newton's steps then bring
-    onto the surface, and those beside an edge or a corner onto that. Raises InputError if scikit-image is missing, or nothing is found."""
+    onto the surface, and those beside an edge or a corner onto that. Raises InputError if
+    scikit-image is missing, or nothing is found."""
     cells = 64.0
     values = sample(distance, Lattice.within(bounds, cells, 1.5))
     crossed = sum(int((np.diff(values < 0, axis=k)).sum()) for k in range(3))

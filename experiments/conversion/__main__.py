@@ -53,6 +53,9 @@ def main() -> None:
     for row in () if given.table else given.rows.split(","):
         key = {"row": row, **options}
         kept.row(key, lambda row=row: measure(row, options))
+    if (OUT / "isosurface.glb").exists() and (OUT / "today.glb").exists():
+        files = [OUT / f"{n}.glb" for n in ("isosurface", "today")]
+        meshes.picture(files, OUT / "beetle.png")
     for found in kept.rows:
         print(json.dumps(found))
 

@@ -11,18 +11,20 @@ import mitsuba as mi
 import numpy as np
 
 from appearance_opt import backend, convert_options, sdf
-from appearance_opt.asset import Asset, Mesh, save
+from appearance_opt.asset import Asset, Mesh, load, save
+from appearance_opt.asset.images import encode_png
 from appearance_opt.asset.types import Material
 from appearance_opt.evaluate.metrics import compare_images
 from appearance_opt.jobs.convert import convert
 from appearance_opt.reference.mesh import MeshReference
 from appearance_opt.reference.opened import Opened
 from appearance_opt.reference.sdf_open import open_source
+from appearance_opt.render.display import display
 from appearance_opt.sdf.sampling import Lattice, march, sample
 from appearance_opt.views import MEASURED
 
 SCENE = "scenes/beetle.py:scene"
-VIEWS, RESOLUTION, SAMPLES = 12, 256, 8
+VIEWS, RESOLUTION, SAMPLES, PICTURED = 12, 256, 8, 5
 
 SHAPES = {
     "sphere": lambda p: sdf.sphere(p, 0.8),
@@ -41,6 +43,18 @@ def look(opened: Opened, asset: Asset) -> dict[str, float]:
     found = compare_images(one, two)
     names = ("psnr", "psnr_covered", "flip")
     return {n: round(float(getattr(found, n)), 4) for n in names}
+
+
+def picture(assets: list[Path], out: Path) -> None:
+    """The scene and meshes of it in one view, side by side."""
+    source = opened(1)
+    subject, size = source.subject, 400
+    views = subject.sampler.held_out(MEASURED).draw(0, VIEWS)[[PICTURED]]
+    drawn = [subject.reference.render(views, size, 16)[0]]
+    for path in assets:
+        local = subject.placement.local(load(path))
+        drawn.append(MeshReference(local).render(views, size, 16)[0])
+    out.write_bytes(encode_png(np.round(255 * display(np.concatenate(drawn, 1))).astype(np.uint8)))
 
 
 def opened(triangles: int, source: Any = SCENE) -> Opened:
