@@ -12,6 +12,7 @@ one. Needs ``../shared/judge/references`` for all assets but relic.
 from __future__ import annotations
 
 import argparse
+from functools import cache
 from typing import TYPE_CHECKING
 
 from experiments.common import OUT as RESULTS
@@ -20,7 +21,7 @@ from experiments.common import Kept, source_of
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from appearance_opt.asset import FileOptions
+    from appearance_opt.asset import Asset, FileOptions
 
 OUT = RESULTS / "files"
 WAYS = {
@@ -53,8 +54,16 @@ def result_of(asset: str, settings: dict) -> Path:
     if not out.is_file():
         out.parent.mkdir(parents=True, exist_ok=True)
         values = appearance_opt.simplify_options("draft", **settings)
-        appearance_opt.simplify(source_of(asset), out, values)
+        appearance_opt.simplify(reference_of(asset), out, values)
     return out
+
+
+@cache
+def reference_of(asset: str) -> Asset:
+    """The heavy asset."""
+    from appearance_opt.asset import load
+
+    return load(source_of(asset))
 
 
 def measure(asset: str, way: str, settings: dict) -> dict:
@@ -70,7 +79,7 @@ def measure(asset: str, way: str, settings: dict) -> dict:
     assert options is not None
     save(load(plain), path, options)
     values = {"views": 6, "resolution": 256}
-    metrics = appearance_opt.compare(source_of(asset), path, **values).metrics
+    metrics = appearance_opt.compare(reference_of(asset), path, **values).metrics
     return {"bytes": path.stat().st_size, "psnr": metrics.psnr_covered}
 
 
