@@ -28,7 +28,7 @@ GLTF, USD, OBJ = (".glb", ".gltf"), (".usd", ".usda", ".usdc", ".usdz"), (".obj"
 QUALITY: dict[MapKind, int] = {"color": 90, "normal": 95, "material": 90}
 """Of lossy codecs, where none is given: an error of a normal moves highlights."""
 
-WEB = "color=webp:80,normal=jpeg:80,material=webp:80"
+WEB = "color=webp:80,normal=jpeg:90,material=webp:60"
 """Lossy WebP halves the resolution of colour differences, and normals are such: at any quality it
 costs 0.5 dB on flight_helmet, where JPEG, which need not do so, costs 0.1."""
 
