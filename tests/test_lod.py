@@ -156,6 +156,12 @@ def test_a_chain_of_three(tmp_path: Path) -> None:
     assert result.record()["levels"][1]["screen"]["unreal"] > 0
 
 
+def test_a_chain_without_time_for_a_fit_is_its_starts() -> None:
+    result = lod(make_asset(12, 16), None, **{**SMALL, "steps": None, "budget": 0.01})
+    assert [level.fit.steps for level in result.fitted] == [0, 0, 0]
+    assert 200 >= result.levels[0].triangle_count > result.levels[2].triangle_count
+
+
 class Killed(Exception):
     pass
 

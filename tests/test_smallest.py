@@ -149,3 +149,11 @@ def test_a_bound_that_cannot_be_met_is_an_error_with_strict(
     told = certificate_in(out)  # of the best that was reached
     assert not told["met"]
     assert told["short_by"] > 0
+
+
+def test_a_search_without_time_hands_out_its_first_start() -> None:
+    result = simplify(
+        make_asset(12, 16), None, max_error="2px", **{**SMALL, "steps": None, "budget": 0.01}
+    )
+    assert result.fit.steps == 0
+    assert result.facts["certificate"]["views"] == 24

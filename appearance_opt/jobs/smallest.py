@@ -16,7 +16,7 @@ from appearance_opt.jobs.result import SimplifyResult
 from appearance_opt.options.bound import Bound, parse_bound
 from appearance_opt.options.chain import PER_PIXEL
 from appearance_opt.stages.export import OURS
-from appearance_opt.stages.levels import Level, fit_level, from_finer
+from appearance_opt.stages.levels import LEAST_SECONDS, Level, fit_level, from_finer
 from appearance_opt.stages.search import SAFETY, SLOPE, Trial, bracket, next_count
 from appearance_opt.views import MEASURED, VALIDATION
 
@@ -33,6 +33,9 @@ if TYPE_CHECKING:
 
 TRIALS = 6
 """Fits of a search, at the most."""
+
+FIRST_SHARE = 1 / 3
+"""Part of the time that the first trial may take."""
 
 VIEWS, FEWEST_VIEWS = 24, 6
 """By which errors are measured, up to 1024 pixels; fewer where images are larger."""
@@ -153,7 +156,7 @@ def find_smallest(
     run.lap("measure")
     levels: dict[int, Level] = {}
     trials: list[Trial] = []
-    longest = 0.0
+    longest = around = 0.0
     while len(trials) < TRIALS:
         count = next_count(trials, SAFETY * bound.limit, available, first, slope)
         left = run.seconds_left()
@@ -162,7 +165,10 @@ def find_smallest(
         if trials and left is not None and left < 0.7 * longest:
             break
         began, k = run.watch.total, len(trials)
-        share = None if left is None else left / (TRIALS - k)
+        # a fit is worth no less than what goes on around it; the first one's kernels are compiled
+        least = 0.0 if left is None else FIRST_SHARE * left if k == 0 else 2 * around
+        share = None if left is None else min(left, max(left / (TRIALS - k), least))
+        share = None if share is None else max(share, LEAST_SECONDS)
         fitting = replace(o.fit, budget=share)
         if kept is not None and kept.done > k:
             fitting = replace(fitting, steps=0)
@@ -185,6 +191,7 @@ def find_smallest(
         trials.append(Trial(count, judge.error(level.drawn)))
         run.lap("measure")
         longest = max(longest, run.watch.total - began)
+        around = level.seconds - level.fit.seconds
     best = _best(trials, SAFETY * bound.limit)
     certificate = certify(
         Judge(subject, bound, pixels, MEASURED).values(levels[best].drawn), bound, pixels

@@ -43,6 +43,9 @@ RESOLUTIONS = (16, 4096)
 
 LEAST_TEXTURE = 16
 
+LEAST_SECONDS = 0.01
+"""Budgets are positive."""
+
 
 @dataclass(frozen=True)
 class Level:
@@ -84,6 +87,8 @@ def level_options(
 ) -> LodOptions:
     """Options of the fit of one level: images of its size, maps in proportion to it."""
     low, high = RESOLUTIONS
+    if seconds is not None:  # no time left is a fit without steps
+        seconds = max(seconds, LEAST_SECONDS)
     first = options.chain.sizes()[0]
     size = options.texture.size
     while size > LEAST_TEXTURE and size * first > options.texture.size * pixels:
