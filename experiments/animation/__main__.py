@@ -180,17 +180,19 @@ def takes_of(heavy: Asset, row: Row, resolution: int) -> dict[str, list[Take]]:
 def run_row(row: Row, settings: dict, node: Path | None) -> dict:
     """Make the candidates of a row and measure them."""
     import appearance_opt
-    from experiments.animation.measure import errors, images_of, summary
+    from experiments.animation.measure import errors, images_of, summary, upright
 
     files = candidates(row, settings, node)
-    takes = takes_of(appearance_opt.load(row.source(), keep_rig=True), row, settings["resolution"])
+    heavy = appearance_opt.load(row.source(), keep_rig=True)
+    takes = takes_of(heavy, row, settings["resolution"])
     scores: dict[str, dict] = {}
-    pictures = {"heavy": [t.images[0] for t in takes["seen clip"]]}
+    shown = upright(heavy, takes["seen clip"])
+    pictures = {"heavy": [t.images[0] for t in shown]}
     for name, path in files.items():
         light = appearance_opt.load(path, keep_rig=True)
         scores[name] = {"triangles": light.triangle_count}
         scores[name] |= {of: summary(errors(light, at)) for of, at in takes.items()}
-        pictures[name] = [images_of(light, t)[0] for t in takes["seen clip"]]
+        pictures[name] = [images_of(light, t)[0] for t in shown]
     write_sheet(OUT / f"{row.label.replace(':', '_')}.png", pictures)
     return {"scores": scores}
 

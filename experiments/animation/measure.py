@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from appearance_opt.asset.posing import pose_asset
 from appearance_opt.evaluate.comparison import render_asset
+from appearance_opt.evaluate.hero import hero_view
 from appearance_opt.evaluate.metrics import compare_images
 from appearance_opt.placement import Placement
-from appearance_opt.views import MEASURED, views_around
+from appearance_opt.views import MEASURED, support, views_around
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -51,6 +52,18 @@ def take(
         images = render_asset(placement.local(posed), drawn, resolution, SAMPLES)
         out.append(Take(clip, time, placement, drawn, images))
     return out
+
+
+def upright(asset: Asset, takes: Sequence[Take]) -> list[Take]:
+    """The same frames of the asset, seen upright, all from one side."""
+    local = [t.placement.local(pose_asset(asset, t.clip, t.time)) for t in takes]
+    hull = support(np.concatenate([a.points() for a in local]))
+    view = hero_view(hull, lambda v: render_asset(local[0], v, 96, 4))
+    size = takes[0].images.shape[1]
+    return [
+        replace(t, views=view, images=render_asset(a, view, size, SAMPLES))
+        for t, a in zip(takes, local, strict=True)
+    ]
 
 
 def images_of(asset: Asset, of: Take) -> NDArray[np.float32]:
