@@ -89,11 +89,12 @@ def undocumented(kind: type, *pages: str) -> list[str]:
 
 
 def test_every_option_is_documented() -> None:
-    from appearance_opt.config import BakeOptions, JointOptions, SimplifyOptions
+    from appearance_opt.config import BakeOptions, JointOptions, LodOptions, SimplifyOptions
     from appearance_opt.options.baking import MAPS
     from appearance_opt.options.source import SourceOptions
 
     assert not undocumented(SimplifyOptions, "usage", "files")
+    assert not undocumented(LodOptions, "lod", "usage", "files")
     assert not undocumented(BakeOptions, "baking", "files")
     assert not undocumented(JointOptions, "baking", "files")
     assert not undocumented(SourceOptions, "black_boxes")

@@ -88,7 +88,7 @@ class ChainOptions(Record):
         parse=numbers("ratio", float),
     )
     max_error: str = option(
-        "flip=0.03",
+        "0.5px",
         "Error at which a coarser level takes over: 0.5px (of silhouettes), flip=0.02 or psnr=35.",
         panel="Levels",
         metavar="BOUND",
