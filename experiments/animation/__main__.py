@@ -10,7 +10,7 @@ and the npm package gltfpack, in ``--node FOLDER`` or on the path; left out with
 read back from their files and measured at the frames between those of the fit, over another clip,
 and at rest: 2 views of each frame that nothing was chosen by. Results are kept row by row in
 ``out/animation/results.json``; ``out/animation/NAME.png`` shows frames of the heavy character,
-every candidate below.
+every candidate beside it.
 """
 
 from __future__ import annotations
@@ -198,12 +198,12 @@ def run_row(row: Row, settings: dict, node: Path | None) -> dict:
 
 
 def write_sheet(path: Path, pictures: dict[str, list]) -> None:
-    """A picture with a row for each candidate (the names are in the text of docs)."""
+    """A picture with a column for each candidate and a row for each frame."""
     from appearance_opt.asset.images import encode_png
     from appearance_opt.evaluate.pictures import picture
 
-    rows = [np.concatenate([picture(i) for i in row], axis=1) for row in pictures.values()]
-    path.write_bytes(encode_png(np.concatenate(rows, axis=0)))
+    columns = [np.concatenate([picture(i) for i in images]) for images in pictures.values()]
+    path.write_bytes(encode_png(np.concatenate(columns, axis=1)))
 
 
 def table(rows: list[dict]) -> str:
