@@ -88,7 +88,7 @@ def march(values: NDArray[np.float32]) -> tuple[NDArray[np.float64], NDArray[np.
         from skimage.measure import marching_cubes
     except ImportError as error:
         raise InputError(
-            "--init marching-cubes needs scikit-image: pip install 'appearance-opt[convert]', or "
+            "the first shape needs scikit-image: pip install 'appearance-opt[convert]', or "
             "start from a sphere"
         ) from error
     p, faces, _, _ = marching_cubes(values, 0.0, gradient_direction="descent")

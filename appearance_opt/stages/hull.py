@@ -11,6 +11,7 @@ from appearance_opt.initial.atlas import unwrap
 from appearance_opt.initial.decimate import decimate
 from appearance_opt.reference.pool import check_images
 from appearance_opt.reference.silhouettes import Silhouettes
+from appearance_opt.sdf.sampling import march
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -60,14 +61,5 @@ def hull_surface(
             "--init hull: the silhouettes leave nothing of the object; images and cameras do not "
             "belong together, or it is too thin: start from a sphere"
         )
-    return isosurface(-distance, low, cell)
-
-
-def isosurface(
-    distance: NDArray[np.float32], low: NDArray, cell: float
-) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
-    """(positions, faces) where ``distance`` (X, Y, Z), negative inside, is zero."""
-    from skimage.measure import marching_cubes
-
-    vertices, faces, _, _ = marching_cubes(distance, 0.0, gradient_direction="descent")
-    return (vertices * cell + low).astype(np.float32), faces.astype(np.int32)
+    positions, faces = march(-distance)
+    return (positions * cell + low).astype(np.float32), faces
