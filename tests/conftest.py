@@ -66,6 +66,16 @@ def one_thread(variant: str) -> Iterator[float]:
 
 
 @pytest.fixture(autouse=True)
+def interruptible() -> Iterator[None]:
+    """No test leaves its handlers of signals to the next: the command line ignores interrupts once
+    all is done, and so would all programs that are started later."""
+    before = {n: signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+@pytest.fixture(autouse=True)
 def inputs_stay(monkeypatch: pytest.MonkeyPatch) -> None:
     """No job of any test changes its inputs."""
     watch_jobs(monkeypatch)

@@ -25,6 +25,9 @@ from appearance_opt.views import look_at
 if TYPE_CHECKING:
     from appearance_opt.views import Views
 
+HANGS = 600
+"""Seconds after which a program counts as hanging, however busy the machine."""
+
 RAYCAST = Path(__file__).parents[1] / "scenes" / "raycast.py"
 
 PROGRAM = """
@@ -191,7 +194,7 @@ def test_a_program_ends_when_its_user_does(tmp_path: Path) -> None:
         process, folder = holder.stdout.readline().split()
         assert Path(folder).is_dir()
         holder.send_signal(signal.SIGINT)
-        holder.communicate()
+        holder.communicate(timeout=HANGS)
     assert not Path(folder).exists()
     with pytest.raises(ProcessLookupError):
         os.kill(int(process), 0)
