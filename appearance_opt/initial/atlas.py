@@ -12,6 +12,7 @@ from scipy.sparse.csgraph import connected_components
 from appearance_opt.asset.normals import summed_normals
 from appearance_opt.initial.sheets import separate
 from appearance_opt.initial.vertex_normals import VertexNormals
+from appearance_opt.initial.workers import atlas_at_rest
 from appearance_opt.latent.mesh import LatentMesh
 
 if TYPE_CHECKING:
@@ -72,7 +73,6 @@ def make_charts(
     scale = max(float(np.ptp(positions, axis=0).max()), 1e-300)
     sheets = separate(positions, faces, single)
     normals = VertexNormals() if follow is None else follow(sheets.positions, sheets.faces)
-    atlas = xatlas.Atlas()
     unit = ((sheets.positions - centre) / scale).astype(np.float32)
     corners, directions = sheets.faces, None
     if normals.faces is not None:
@@ -82,13 +82,14 @@ def make_charts(
     # vertices at one place are one to xatlas: what lies back to back is a mesh of its own
     parts = [np.flatnonzero(~sheets.behind), np.flatnonzero(sheets.behind)]
     parts = [own for own in parts if len(own)]
-    for own in parts:
-        indices = np.ascontiguousarray(corners[own], np.uint32)
-        atlas.add_mesh(np.ascontiguousarray(unit), indices, directions)
     chart = xatlas.ChartOptions()
     chart.max_iterations = 2
     chart.normal_seam_weight = ALWAYS
-    atlas.generate(chart_options=chart, pack_options=_pack_options(1024, GUTTER, 0.0))
+    with atlas_at_rest() as atlas:
+        for own in parts:
+            indices = np.ascontiguousarray(corners[own], np.uint32)
+            atlas.add_mesh(np.ascontiguousarray(unit), indices, directions)
+        atlas.generate(chart_options=chart, pack_options=_pack_options(1024, GUTTER, 0.0))
     vertex, frames, uvs = _join(atlas, parts)
     if normals.vertex is not None:
         vertex = normals.vertex[vertex]
@@ -206,13 +207,11 @@ def pack_charts(
 
 
 def _pack(charts: LatentMesh, options: xatlas.PackOptions) -> xatlas.Atlas:
-    import xatlas
-
-    atlas = xatlas.Atlas()
-    atlas.add_uv_mesh(
-        np.ascontiguousarray(charts.uvs), np.ascontiguousarray(charts.frame_faces, np.uint32)
-    )
-    atlas.generate(pack_options=options)
+    with atlas_at_rest() as atlas:
+        atlas.add_uv_mesh(
+            np.ascontiguousarray(charts.uvs), np.ascontiguousarray(charts.frame_faces, np.uint32)
+        )
+        atlas.generate(pack_options=options)
     return atlas
 
 
