@@ -7,6 +7,7 @@ import json
 import shutil
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
@@ -221,18 +222,18 @@ def test_jobs_that_change_an_input_would_be_noticed(
     ball: Asset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The watch of every test, on a job with a planted fault."""
-    from appearance_opt.jobs import lifecycle as job
+    from appearance_opt.jobs.result import Result
 
     save(ball, tmp_path / "a.glb")
     (tmp_path / "beside.txt").write_text("kept")
-    write = job.write
+    write = Result.write
     for name in ("a.glb", "beside.txt"):
 
-        def faulty(asset: Asset, path: Path, files: object, name: str = name) -> None:
-            write(asset, path, files)
+        def faulty(result: Result, *given: Any, name: str = name) -> None:
+            write(result, *given)
             (tmp_path / name).write_bytes((tmp_path / name).read_bytes() + b"x")
 
-        monkeypatch.setattr(job, "write", faulty)
+        monkeypatch.setattr(Result, "write", faulty)
         with pytest.raises(AssertionError, match="has changed its input"):
             appearance_opt.simplify(tmp_path / "a.glb", tmp_path / "b.glb", quick(triangles=50))
         save(ball, tmp_path / "a.glb")

@@ -84,8 +84,11 @@ def credits_of(stage: Any) -> Credits:
     return Credits(said if isinstance(said, str) else "")
 
 
-def note_dropped(stage: Any, note: Callable[[str], None]) -> None:
-    """Note cameras, lights, texture coordinates beside the first ones and custom data, with
+def note_dropped(
+    stage: Any, note: Callable[[str], None], sets_read: Callable[[Any], Iterable[str]]
+) -> None:
+    """Note cameras, lights, texture coordinates that no texture reads, though others are there
+    (``sets_read``: names of those that the textures of a mesh read), and custom data, with
     counts."""
     from pxr import UsdGeom, UsdLux
 
@@ -96,8 +99,10 @@ def note_dropped(stage: Any, note: Callable[[str], None]) -> None:
             found["cameras"].append(name)
         elif prim.HasAPI(UsdLux.LightAPI):
             found["lights"].append(name)
-        elif prim.IsA(UsdGeom.Mesh) and _sets(prim) > 1:
-            found["spare"].append(name)
+        elif prim.IsA(UsdGeom.Mesh):
+            sets = _sets(prim)
+            if len(sets) > 1 and sets - set(sets_read(prim)):
+                found["spare"].append(name)
         if prim.IsA(UsdGeom.Xformable) and prim.HasAuthoredCustomData():
             found["custom"].append(name)
     for key, one, many, what in (
@@ -111,13 +116,13 @@ def note_dropped(stage: Any, note: Callable[[str], None]) -> None:
             note(f"{told} ({list_names(found[key])})")
 
 
-def _sets(prim: Any) -> int:
-    """How many sets of texture coordinates has a mesh?"""
+def _sets(prim: Any) -> set[str]:
+    """Names of the sets of texture coordinates of a mesh."""
     from pxr import Sdf, UsdGeom
 
     kinds = (Sdf.ValueTypeNames.TexCoord2fArray, Sdf.ValueTypeNames.TexCoord2dArray)
     primvars = UsdGeom.PrimvarsAPI(prim).GetPrimvarsWithValues()
-    return sum(p.GetTypeName() in kinds for p in primvars)
+    return {str(p.GetPrimvarName()) for p in primvars if p.GetTypeName() in kinds}
 
 
 def write_nodes(stage: Any, top: str, asset: Asset) -> tuple[list[str], NDArray]:

@@ -273,7 +273,7 @@ class _Reader:
             meshes, origin = settle(meshes, self.note)
         else:
             meshes = [replace(m, positions=m.positions.astype(np.float32)) for m in meshes]
-        usd_nodes.note_dropped(self.stage, self.note)
+        usd_nodes.note_dropped(self.stage, self.note, self.materials.uv_names)
         return Asset(
             tuple(meshes),
             self.path.stem,
