@@ -216,6 +216,6 @@ def _least_squares(
     diagonal = matrix.diagonal()
     scale = diags(1 / np.sqrt(diagonal))
     scaled = scale @ matrix @ scale
-    out = np.stack([scale @ cg(scaled, scale @ right[:, c])[0] for c in range(3)], axis=1)
+    out = np.stack([scale @ cg(scaled, scale @ right[:, c], atol=0.0)[0] for c in range(3)], axis=1)
     vague = np.linalg.norm(out, axis=1) < SHORTEST
     return np.where(vague[:, None], own, unit(out))
