@@ -16,7 +16,7 @@ from appearance_opt.asset.types import Asset, Material, Mesh, Texture
 from appearance_opt.config import SimplifyOptions, simplify_options
 from appearance_opt.digest import digest
 from appearance_opt.errors import InputError
-from appearance_opt.jobs.simplify import fingerprint
+from appearance_opt.jobs.lifecycle import fingerprint
 from appearance_opt.latent.mesh import LatentMesh
 from appearance_opt.optimize import archive
 from appearance_opt.optimize.checkpoint import Checkpointer

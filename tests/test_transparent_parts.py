@@ -14,7 +14,7 @@ from appearance_opt.asset import load, save
 from appearance_opt.asset.alpha import kind_of, seen_through
 from appearance_opt.asset.types import Asset, Material, Mesh, Texture
 from appearance_opt.errors import InputError
-from appearance_opt.jobs.simplify import fingerprint
+from appearance_opt.jobs.lifecycle import fingerprint
 from appearance_opt.placement import Placement
 from appearance_opt.reference.subject import Subject
 from appearance_opt.stages.pair import Pair

@@ -13,8 +13,13 @@ from appearance_opt import __version__, backend
 from appearance_opt.asset.types import Asset
 from appearance_opt.config import ConvertOptions, resolve_options
 from appearance_opt.digest import digest
-from appearance_opt.errors import InputError
-from appearance_opt.jobs.lifecycle import close_run, load_layout, open_run, write_levels
+from appearance_opt.jobs.lifecycle import (
+    CHECKPOINT_SECONDS,
+    close_run,
+    load_layout,
+    open_run,
+    write_levels,
+)
 from appearance_opt.jobs.paths import Outputs
 from appearance_opt.jobs.result import SimplifyResult
 from appearance_opt.optimize.archive import IMAGES
@@ -34,8 +39,6 @@ if TYPE_CHECKING:
     from appearance_opt.progress import Progress
     from appearance_opt.reference.opened import Opened
     from appearance_opt.stages.run import Run
-
-CHECKPOINT_SECONDS = 10.0
 
 OPENERS = {
     "sdf": ("appearance_opt.reference.sdf_open", "open_source"),
@@ -77,9 +80,8 @@ def convert(
     options = resolve_options(ConvertOptions, options, values)
     check_choice("kind", kind, tuple(OPENERS))
     outputs = Outputs.of(out, options, report=report, checkpoint=checkpoint)
-    with open_run(outputs, (options.start.file, *inputs), options, progress, began) as run:
-        if resume and checkpoint is None:
-            raise InputError("--resume needs --checkpoint DIR")
+    named = (options.start.file, *inputs)
+    with open_run(outputs, named, options, progress, began, resume) as run:
         given = options.start.file
         first = None if given is None else load_layout(given, options, "ignore")
         outputs.check_inputs(first)

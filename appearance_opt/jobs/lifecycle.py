@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from appearance_opt import backend
+from appearance_opt import __version__, backend
 from appearance_opt.asset import load, write
+from appearance_opt.digest import digest
+from appearance_opt.errors import InputError
 from appearance_opt.interrupts import Interrupts
 from appearance_opt.jobs.paths import base_path, holds_displacement, level_path
 from appearance_opt.jobs.report import write_job_report
 from appearance_opt.publish import publication
+from appearance_opt.reference.subject import Subject
 from appearance_opt.stages.displacement import require_memory
 from appearance_opt.stages.export import write_companion
 from appearance_opt.stages.pair import Pair
@@ -27,7 +31,11 @@ if TYPE_CHECKING:
     from appearance_opt.jobs.result import Result, SimplifyResult
     from appearance_opt.progress import Progress
     from appearance_opt.publish import Publication
-    from appearance_opt.reference.subject import Subject
+    from appearance_opt.stages.parts import Parts
+
+
+CHECKPOINT_SECONDS = 10.0
+"""Between two checkpoints."""
 
 
 @contextmanager
@@ -37,16 +45,25 @@ def open_run(
     options: CommonOptions,
     progress: Progress | None = None,
     began: float | None = None,
+    resume: bool = False,
 ) -> Iterator[Run]:
     """A job under way, which alone may write its ``outputs``; they replace none of the files that
-    are ``named``. Raises InputError."""
+    are ``named``. ``resume``: it is to go on from its checkpoint. Raises InputError."""
     run = Run(
         Stopwatch(began), options.fit.budget, progress, with_report=outputs.report is not None
     )
     outputs.check()
     outputs.check_sources(*named)
     with outputs.held(), Interrupts() as run.interrupts:
+        if resume and outputs.checkpoint is None:
+            raise InputError("--resume needs --checkpoint DIR")
         yield run
+
+
+def begin_reading(run: Run, source: str | Path | Asset) -> None:
+    """Say that the input is read."""
+    is_file = isinstance(source, (str, Path))
+    run.begin(f"reading {Path(str(source)).name}" if is_file else "checking the asset")
 
 
 def load_source(
@@ -76,6 +93,21 @@ def load_layout(source: str | Path | Asset, options: CommonOptions, missing_text
 def name_of(source: str | Path | Asset) -> str:
     """What to call an input in messages."""
     return str(source) if isinstance(source, (str, Path)) else source.name
+
+
+def fingerprint(options: CommonOptions, asset: Asset, first: Asset | None) -> str:
+    """Hash of all that a result depends on: version, options, and everything that was read, but for
+    where it was read from and what was said about it. ``first``: the mesh of ``--init``."""
+    read = [None if a is None else replace(a, files=(), notes=()) for a in (asset, first)]
+    return digest([__version__, options, *read])
+
+
+def whole_subject(subject: Subject, parts: Parts, options: CommonOptions) -> Subject:
+    """What a report shows of a ``subject``: with the parts that passed through, which may lie
+    outside of what the views of its fit show."""
+    if not parts.kept:
+        return subject
+    return Subject.of_asset(parts.whole, options.views.seed, options.views.light)
 
 
 def read_pair(

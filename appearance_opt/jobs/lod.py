@@ -4,6 +4,7 @@ between them, as measured."""
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,7 +14,6 @@ import numpy as np
 from appearance_opt import backend
 from appearance_opt.asset import HOLDS_LEVELS, write
 from appearance_opt.config import LodOptions, resolve_options
-from appearance_opt.errors import InputError
 from appearance_opt.evaluate.chart import Chart
 from appearance_opt.evaluate.comparison import render_asset
 from appearance_opt.evaluate.switching import (
@@ -25,10 +25,18 @@ from appearance_opt.evaluate.switching import (
     on_screen,
     sphere_in_views,
 )
-from appearance_opt.jobs.lifecycle import close_run, load_source, name_of, open_run
+from appearance_opt.jobs.lifecycle import (
+    CHECKPOINT_SECONDS,
+    begin_reading,
+    close_run,
+    fingerprint,
+    load_source,
+    name_of,
+    open_run,
+    whole_subject,
+)
 from appearance_opt.jobs.paths import Outputs, lod_path
 from appearance_opt.jobs.result import Result
-from appearance_opt.jobs.simplify import CHECKPOINT_SECONDS, fingerprint
 from appearance_opt.options.bound import Bound, parse_bound
 from appearance_opt.reference.subject import Subject
 from appearance_opt.stages.levels import KeptLevels, Level, fit_levels
@@ -161,11 +169,8 @@ def lod(
     )
     lods = options.chain.count() if separate else 0
     outputs = Outputs.of(out, options, report=report, checkpoint=checkpoint, lods=lods)
-    with open_run(outputs, (source, *inputs), options, progress, began) as run:
-        if resume and checkpoint is None:
-            raise InputError("--resume needs --checkpoint DIR")
-        is_file = isinstance(source, (str, Path))
-        run.begin(f"reading {Path(str(source)).name}" if is_file else "checking the asset")
+    with open_run(outputs, (source, *inputs), options, progress, began, resume) as run:
+        begin_reading(run, source)
         asset = load_source(source, options)
         outputs.check_inputs(asset)
         parts = split(asset, name_of(source), "simplify", named=options.parts.keep)
@@ -183,15 +188,11 @@ def lod(
         run.lap("reference")
         result = _make(subject, parts, triangles, options, run, kept)
 
-        def shown() -> Subject:
-            if not parts.kept:
-                return subject
-            return Subject.of_asset(parts.whole, options.views.seed, options.views.light)
-
         def beside(path: Path, together: Publication) -> None:
             if separate:
                 result.write_files(path, together, options.output.for_file(path))
 
+        shown = partial(whole_subject, subject, parts, options)
         close_run(run, result, outputs, options, shown, beside)
         return result
 

@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from appearance_opt import __version__, backend
+from appearance_opt import backend
 from appearance_opt.config import SimplifyOptions, resolve_options, with_values
-from appearance_opt.digest import digest
-from appearance_opt.errors import InputError
 from appearance_opt.jobs.lifecycle import (
+    CHECKPOINT_SECONDS,
+    begin_reading,
     close_run,
+    fingerprint,
     load_layout,
     load_source,
     name_of,
     open_run,
+    whole_subject,
     write_levels,
 )
 from appearance_opt.jobs.paths import Outputs
@@ -24,22 +24,18 @@ from appearance_opt.jobs.result import SimplifyResult
 from appearance_opt.jobs.smallest import TRIALS, find_smallest
 from appearance_opt.optimize.checkpoint import Checkpointer
 from appearance_opt.reference.subject import Subject
-from appearance_opt.stages.choice import choose_start
-from appearance_opt.stages.export import Exporter, export
-from appearance_opt.stages.fitting import fit_start
-from appearance_opt.stages.levels import RESOLUTIONS, KeptLevels
+from appearance_opt.stages.levels import RESOLUTIONS, KeptLevels, fit_level
 from appearance_opt.stages.parts import split
 from appearance_opt.stages.start import atlas_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
+    from pathlib import Path
 
     from appearance_opt.asset.types import Asset
     from appearance_opt.progress import Progress
     from appearance_opt.stages.parts import Parts
     from appearance_opt.stages.run import Run
-
-CHECKPOINT_SECONDS = 10.0
 
 
 def simplify(
@@ -70,11 +66,8 @@ def simplify(
     options = for_size(resolve_options(SimplifyOptions, options, values))
     outputs = Outputs.of(out, options, report=report, checkpoint=checkpoint)
     named = (source, options.start.file, *inputs)
-    with open_run(outputs, named, options, progress, began) as run:
-        if resume and checkpoint is None:
-            raise InputError("--resume needs --checkpoint DIR")
-        is_file = isinstance(source, (str, Path))
-        run.begin(f"reading {Path(str(source)).name}" if is_file else "checking the asset")
+    with open_run(outputs, named, options, progress, began, resume) as run:
+        begin_reading(run, source)
         asset, given = load_source(source, options), options.start.file
         first = None if given is None else load_layout(given, options, "ignore")
         outputs.check_inputs(asset, first)
@@ -100,13 +93,7 @@ def simplify(
             result = find_smallest(subject, parts, options, run, kept)
         else:
             result = _fit(subject, parts, first, options, run)
-
-        def shown() -> Subject:
-            if not parts.kept:
-                return subject
-            # they may lie outside of what the fit's views show
-            return Subject.of_asset(parts.whole, options.views.seed, options.views.light)
-
+        shown = partial(whole_subject, subject, parts, options)
         close_run(run, result, outputs, options, shown, partial(write_levels, result, options))
     return result
 
@@ -121,16 +108,10 @@ def _fit(
     if first is not None:
         given, told = atlas_of(first, subject, options)
         notes += told
-    start, left = choose_start(subject, given, options, run)
-    run.lap("start")
-    model, fit, error = fit_start(subject, start, left, run)
-    name = f"{asset.name}_{len(start.mesh.faces)}"
-    exporter = Exporter(subject.placement, asset, name)
-    exported = export(model, start, subject, left, exporter)
-    run.lap("export")
+    level = fit_level(subject, asset, options, run, options.views.resolution, given)
     source = (asset.name, asset.triangle_count)
-    notes += [*start.notes, *parts.describe_nodes(exported.asset)]
-    return SimplifyResult.of(exported, parts, fit, source, notes, error)
+    notes += [*level.notes, *parts.describe_nodes(level.asset)]
+    return SimplifyResult.of(level.exported, parts, level.fit, source, notes, level.error)
 
 
 def for_size(options: SimplifyOptions) -> SimplifyOptions:
@@ -139,10 +120,3 @@ def for_size(options: SimplifyOptions) -> SimplifyOptions:
         return options
     low, high = RESOLUTIONS
     return with_values(options, resolution=min(max(options.start.pixels, low), high))
-
-
-def fingerprint(options: SimplifyOptions, asset: Asset, first: Asset | None) -> str:
-    """Hash of all that a result depends on: version, options, and everything that was read, but for
-    where it was read from and what was said about it. ``first``: the mesh of ``--init``."""
-    read = [None if a is None else replace(a, files=(), notes=()) for a in (asset, first)]
-    return digest([__version__, options, *read])

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from appearance_opt.asset.types import Asset
     from appearance_opt.config import LodOptions, SimplifyOptions
     from appearance_opt.errors import DivergedError
+    from appearance_opt.latent.mesh import LatentMesh
     from appearance_opt.optimize.loop import FitResult
     from appearance_opt.reference.subject import Subject
     from appearance_opt.stages.export import Exported
@@ -110,12 +111,18 @@ def from_finer(subject: Subject, finer: Asset) -> Subject:
 
 
 def fit_level(
-    made_from: Subject, source: Asset, options: SimplifyOptions, run: Run, pixels: int
+    made_from: Subject,
+    source: Asset,
+    options: SimplifyOptions,
+    run: Run,
+    pixels: int,
+    given: LatentMesh | None = None,
 ) -> Level:
-    """One mesh of ``options.start.triangles``, started from ``made_from`` and fitted to its images.
-    ``source``: what nodes, names and credits come from."""
+    """One mesh, by default of ``options.start.triangles``, started from ``made_from`` and fitted to
+    its images. ``source``: what nodes, names and credits come from; ``given``: see
+    ``choose_start``."""
     began = run.watch.total
-    start, o = choose_start(made_from, None, options, run)
+    start, o = choose_start(made_from, given, options, run)
     run.lap("start")
     model, fitted, error = fit_start(made_from, start, o, run)
     name = f"{source.name}_{len(start.mesh.faces)}"
